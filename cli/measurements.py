@@ -30,6 +30,11 @@ MEASUREMENTS: dict[str, Command] = {
         "fit recipes with one thing replaced by the truth, and tabulate the dB that each gains",
         "report oracle-ladder data/car-0-small --out runs/oracle",
     ),
+    "report realism": Command(
+        "spike4dgs.cli.studies:realism",
+        "tell a real recording from simulated ones of equal rates: a classifier, statistics, and ranks of image makers",
+        "report realism car.dat --width 400 --height 250 --out runs/realism",
+    ),
     "report results": Command(
         "spike4dgs.cli.studies:results",
         "measure what the published tables show, and write them from the records",

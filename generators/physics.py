@@ -49,7 +49,7 @@ class Physics:
         flicker_hz: frequency of the flicker, twice that of the mains.
         flicker_duty: share of a period in which an LED is on; 0 is a sine.
         warming_k: temperature of the sensors in the clip above that at calibration.
-        reset_noise, read_noise, dead_ticks: see `sensor.model.Sensor`.
+        reset_noise, read_noise, dead_ticks, clock_ripple: see `sensor.model.Sensor`.
         light: share of the light that reaches the sensors, in the clip and at calibration, as of a stopped-down lens.
         lost_ticks: share of a clip's ticks that each camera loses; the scene lists them as gaps.
         speed: of all motion, in units of the world's own.
@@ -69,6 +69,7 @@ class Physics:
     reset_noise: float = 0.0
     read_noise: float = 0.0
     dead_ticks: float = 0.0
+    clock_ripple: float = 0.0
     light: float = 1.0
     lost_ticks: float = 0.0
     speed: float = 1.0
@@ -112,6 +113,7 @@ _WORDS = {
     "reset_noise": "reset",
     "read_noise": "read",
     "dead_ticks": "dead",
+    "clock_ripple": "ripple",
     "light": "light",
     "lost_ticks": "lost",
     "speed": "speed",
@@ -156,6 +158,8 @@ class PhysicsOptions:
         reset_noise: Standard deviation of the charge that a reset takes, in thresholds, such as 0.0009 (kTC).
         read_noise: Standard deviation of the comparator's error in a tick, in thresholds, such as 0.006.
         dead_ticks: Ticks after its charge is full in which a pixel collects no light; 1 in a published calibration.
+        clock_ripple: How much more or less charge a spike takes by where in the tick it falls, in thresholds, such as
+            0.007, so that pixels lock to whole intervals.
         light: Share of the light that reaches the sensors, in the clip and at calibration, such as 0.25; above 1
             highlights saturate. The scene's id says how much: -light1of4.
         lost_ticks: Share of the clip's ticks that each camera loses, such as 0.05. The scene lists them as gaps:
@@ -179,6 +183,7 @@ class PhysicsOptions:
     reset_noise: float | None = None
     read_noise: float | None = None
     dead_ticks: float | None = None
+    clock_ripple: float | None = None
     light: float | None = None
     lost_ticks: float | None = None
     speed: float | None = None
@@ -218,6 +223,7 @@ _RANGES: dict[str, tuple[str, float, float]] = {  # what it is, from, to
     "reset_noise": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
     "read_noise": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
     "dead_ticks": ("ticks from 0 to 100", 0, 100),
+    "clock_ripple": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
     "light": ("a share from 1/1024 to 16", 1 / 1024, 16),
     "lost_ticks": ("a share from 0 to 0.5", 0, 0.5),
     "speed": ("a factor from 1/64 to 16", 1 / 64, 16),

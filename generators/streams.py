@@ -37,7 +37,8 @@ from spike4dgs.generators.sensor.calibration import dark_map, gain_map, write_ma
 from spike4dgs.generators.sensor.light import FlickeringInstants, FlickeringMeans
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 
-_OF_SENSOR = ("psf_px", "warming_k", "reset_noise", "read_noise", "dead_ticks")  # of the physics, where they are on
+# of the physics, where they are on
+_OF_SENSOR = ("psf_px", "warming_k", "reset_noise", "read_noise", "dead_ticks", "clock_ripple")
 CALIBRATION_TICKS = calibration.FLAT_TICKS + calibration.DARK_TICKS
 
 
@@ -109,6 +110,7 @@ def sensor_of(job: Job, camera: Camera) -> Sensor:
         reset_noise=job.physics.reset_noise,
         read_noise=job.physics.read_noise,
         dead_ticks=job.physics.dead_ticks,
+        clock_ripple=job.physics.clock_ripple,
     )
 
 

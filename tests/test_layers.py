@@ -34,7 +34,7 @@ ORDER = {
     "baselines": "nearest_view images radiance_field spike_render exposure starts tracking spacetime recipes",
     "leaderboard": "tracks entry reading truth_check rank verify submit page season",
     "studies": "kit hard_cases speed_error gpu_receipt images recorder_runs recorder saved_models modality "
-    "oracle_truth oracle_methods oracle_ladder faults patterns poses spike_agreement scene_noise "
+    "oracle_truth oracle_methods oracle_ladder faults patterns poses realism spike_agreement scene_noise "
     "second_renderer tuning results",
 }
 FRONT = ROOT / "front" / "__init__.py"  # what `import spike4dgs` gives; no room

@@ -16,12 +16,16 @@ hash of (seed, pixel, tick), so it does not depend on batches or threads. The li
 the most that a spike takes, 1 + 3.46 / sqrt(N), so that a pixel in glaring light still fires in every tick. Reset noise
 (kTC) is the random part of the charge that a reset takes: the variance of a spike's charge is 1 / N + reset_noise^2.
 
-Two effects have a slower loop (`sensor.uneven_kernels`). Read noise is the comparator's: in every tick it sees the
+Three effects have a slower loop (`sensor.uneven_kernels`). Read noise is the comparator's: in every tick it sees the
 charge plus read_noise times such a g, so a spike comes early or late, but the charge that a spike takes stays 1 and the
 error does not add up. With dead ticks a pixel collects no light for so long after its charge has crossed the threshold,
 from the very moment inside the tick. A charge that takes 1 / x ticks to fill then gives intervals of dead_ticks + 1 / x
 in the mean: the rate is x / (1 + x dead_ticks), and light is proportional to 1 / (interval - dead_ticks). With one dead
-tick x has no limit below MOST_CHARGE thresholds a tick, and bright pixels may fire in adjacent ticks.
+tick x has no limit below MOST_CHARGE thresholds a tick, and bright pixels may fire in adjacent ticks. The readout clock
+couples into the comparator: a crossing of the threshold a ticks before the tick ends takes the charge
+1 - clock_ripple w(a), w(a) = 6 sqrt(3) a (1 - a) (1 - 2 a), a cubic like a sine with extremes 1 and -1. A crossing near
+a tick's border moves away from it, so pixels lock: where a charge of x a tick takes 1 / x within about clock_ripple / x
+of a whole number of ticks, every interval has that number. The mean of w is 0, and light keeps its law elsewhere.
 
 Radiance between keys is a cubic Hermite (Catmull-Rom) curve: the tangent at a key is the slope between its neighbours,
 in the first and last interval the slope of that interval itself. With p0..p3 the keys around the interval from p1 to p2
@@ -82,6 +86,7 @@ class Sensor:
         reset_noise: standard deviation of the charge that a reset takes, in thresholds.
         read_noise: standard deviation of the comparator's error in a tick, in thresholds.
         dead_ticks: ticks after a crossing of the threshold in which a pixel collects no light.
+        clock_ripple: how much more or less charge a spike takes, by where in the tick it fell, in thresholds.
     """
 
     radiance_gain: float = SENSOR.radiance_gain
@@ -92,6 +97,7 @@ class Sensor:
     reset_noise: float = 0.0
     read_noise: float = 0.0
     dead_ticks: float = 0.0
+    clock_ripple: float = 0.0
 
     @property
     def spent_sd(self) -> float:
@@ -99,9 +105,14 @@ class Sensor:
         return math.hypot(self.photons**-0.5 if self.photons else 0.0, self.reset_noise)
 
     @property
+    def most_over(self) -> float:
+        """The most that a spike takes above one threshold, in thresholds."""
+        return self.spent_sd * MOST_DEVIATION + self.clock_ripple
+
+    @property
     def is_uneven(self) -> bool:
-        """True where spikes come at other ticks than the charge's."""
-        return self.read_noise > 0 or self.dead_ticks > 0
+        """True where spikes come at other ticks than the charge's, or take other charges than shot noise's."""
+        return self.read_noise > 0 or self.dead_ticks > 0 or self.clock_ripple > 0
 
     @property
     def noise_key(self) -> int:
@@ -156,7 +167,7 @@ def simulate(
     if sensor.is_uneven:
         state = state.astype(np.int64)
         top, rest = np.int64(head * unit + unit if sensor.dead_ticks else THRESHOLD), np.zeros(len(state))
-        more = _steps(sensor.read_noise, unit), top, float(sensor.dead_ticks), rest
+        more = _steps(sensor.read_noise, unit), top, float(sensor.dead_ticks), sensor.clock_ripple * unit, rest
     with ThreadPoolExecutor(threads) as pool:
         for first in range(0, n_intervals, per_batch):
             last = min(first + per_batch, n_intervals)
@@ -174,11 +185,10 @@ def simulate(
 
 def _noise_units(sensor: Sensor) -> tuple[float, float, np.int32]:
     """Return the room below zero in thresholds, and the charge units of a threshold and of one step of `deviate`."""
-    sd = sensor.spent_sd
-    head = sd * MOST_DEVIATION
+    head = sensor.most_over
     most = MOST_CHARGE if sensor.dead_ticks else 1
     unit = float(np.floor(THRESHOLD / (most + head)))
-    return head, unit, _steps(sd, unit)
+    return head, unit, _steps(sensor.spent_sd, unit)
 
 
 def _steps(sd: float, unit: float) -> np.int32:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Float32, Float64, Int32
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD, charge_after_spike, charge_of_tick
-from spike4dgs.generators.sensor.model import DEVIATE_SD, MOST_CHARGE, MOST_DEVIATION, Keys, Sensor
-from spike4dgs.generators.sensor.uneven_kernels import READ_SALT
+from spike4dgs.generators.sensor.model import DEVIATE_SD, MOST_CHARGE, Keys, Sensor
+from spike4dgs.generators.sensor.uneven_kernels import READ_SALT, wave
 
 _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)  # two-point Gauss-Legendre nodes of [0, 1]: exact for cubics
 
@@ -57,7 +57,7 @@ def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tu
     rest, most = np.zeros(charge.shape), MOST_CHARGE if sensor.dead_ticks else 1  # rest: dead ticks that are left
     for tick, mean in enumerate(means):
         awake = np.maximum(1 - rest, 0.0)  # share of the tick
-        added = charge_of_tick(gain * sensor.radiance_gain * mean, dark, most + sd * MOST_DEVIATION)
+        added = charge_of_tick(gain * sensor.radiance_gain * mean, dark, most + sensor.most_over)
         level = level + awake * added
         shown = level
         if sensor.read_noise:
@@ -66,7 +66,7 @@ def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tu
         yield fired, shown
         ago = np.clip((shown - 1) / np.maximum(added, 1e-30), 0, awake)  # ticks since the charge crossed the threshold
         lost = added * np.minimum(ago, sensor.dead_ticks)
-        spent = 1 + sd * deviates(pixels, tick, sensor.noise_key) + lost
+        spent = 1 + sd * deviates(pixels, tick, sensor.noise_key) - sensor.clock_ripple * wave(ago) + lost
         level = np.where(fired, charge_after_spike(level, spent), level)
         rest = np.where(fired, np.maximum(sensor.dead_ticks - ago, 0), np.maximum(rest - 1, 0))
 

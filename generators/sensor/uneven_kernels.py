@@ -1,6 +1,6 @@
-"""The inner loop of `sensor.model` for a comparator that errs and for a pixel that rests after a spike.
+"""The inner loop of `sensor.model` for a comparator that errs or ripples, and for a pixel that rests after a spike.
 
-It is a plain loop over pixels, about 11 ns for a pixel and tick, 13 times as long as `sensor.kernels` takes; where both
+It is a plain loop over pixels, about 11 ns for a pixel and tick, 13 times as long as `sensor.kernels` takes; where all
 effects are off it gives the same bits. Charge is 64 bits wide, because an early spike leaves a pixel below zero and a
 late one above the threshold.
 """
@@ -15,6 +15,15 @@ from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.generators.sensor.kernels import BLOCK, _along, _equal, _prepare, _steady, deviate, mix
 
 READ_SALT = 0x7F4A7C15  # the comparator's random numbers are others than those of the charge
+_WAVE = 6 * 3**0.5  # its extremes are then 1 and -1
+
+
+def wave(ago: Any) -> Any:
+    """Return the ripple, in [-1, 1], for a crossing `ago` ticks before its tick ends; a cubic has defined bits."""
+    return _WAVE * ago * (1.0 - ago) * (1.0 - 2.0 * ago)
+
+
+_wave = kernel(wave)
 
 
 @kernel
@@ -33,6 +42,7 @@ def integrate_uneven(
     read: Any,
     top: Any,
     dead: Any,
+    ripple: Any,
     rest: Any,
     words: Any,
     first_block: Any,
@@ -41,8 +51,8 @@ def integrate_uneven(
     """Fill words[:, first_block:last_block], and advance `charge` and `rest`; see `kernels.integrate`.
 
     charge [P] int64; `read`: charge units of one step of `deviate` in the comparator, 0 is off; `top`: the threshold in
-    charge units; `dead`: ticks after a crossing of the threshold in which a pixel collects nothing; rest [P] float64:
-    how many of them are left.
+    charge units; `dead`: ticks after a crossing of the threshold in which a pixel collects nothing; `ripple`: charge
+    units; rest [P] float64: how many of the dead ticks are left.
     """
     w = np.empty(6 * BLOCK, np.float32)
     increment = np.empty(BLOCK, np.int32)
@@ -78,9 +88,9 @@ def integrate_uneven(
                     if shown >= top:
                         word |= np.uint64(1) << np.uint64(i)
                         c -= np.int64(unit) + np.int64(noise) * deviate(pixel, now)
-                        if dead > 0.0:  # from the crossing on, inside the tick
+                        if dead > 0.0 or ripple > 0.0:  # from the crossing on, inside the tick
                             ago = min((shown - top) / x, 1.0 - rest[p + i]) if x > 0 else 0.0
-                            c -= np.int64(min(ago, dead) * x)
+                            c += np.int64(ripple * _wave(ago)) - np.int64(min(ago, dead) * x)
                             asleep = max(dead - ago, 0.0)
                         c = min(c, top - 1)  # a full well
                     charge[p + i], rest[p + i] = c, asleep

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-KINDS = ("records", "searches")
+KINDS = ("records", "searches", "realism")
 
 
 def pattern(*kinds: str) -> re.Pattern[str]:

@@ -397,15 +397,16 @@ def test_the_loop_for_uneven_spikes_gives_the_bits_of_the_fast_one_where_both_ef
     read=st.sampled_from([0.0, 0.003, 0.05]),
     dead=st.sampled_from([0, 0.4, 1, 2.5]),
     reset=st.sampled_from([0.0, 0.01]),
+    ripple=st.sampled_from([0.0, 0.01]),
     bright=st.sampled_from([0.3, 3.0, 12.0]),
     seed=st.integers(0, 2**31),
 )
-def test_uneven_spikes_equal_the_twins(read, dead, reset, bright, seed):
+def test_uneven_spikes_equal_the_twins(read, dead, reset, ripple, bright, seed):
     rng = np.random.default_rng(seed)
     keys = (bright * rng.random((6, 7, 13))).astype(np.float32)
     keys[:, :, :4] = keys[0, :, :4]
     ticks, n = np.arange(6) * 15, 71
-    sensor = uneven(7, 13, read_noise=read, dead_ticks=dead, reset_noise=reset)
+    sensor = uneven(7, 13, read_noise=read, dead_ticks=dead, reset_noise=reset, clock_ripple=ripple)
     charge = random_charge(7, 13, [seed])
     got = stream(keys, ticks, n, sensor, charge).window(0, n)
     expected = simulate_reference(keys, ticks, n, sensor, charge)
@@ -437,6 +438,21 @@ def test_dead_ticks_add_to_every_interval(rate, dead):
     assert 1 / (mean - dead) == pytest.approx(rate, rel=0.01)
     assert intervals.max() - intervals.min() <= 1  # the rest of the charge is kept, as time
     assert spikes.mean() == pytest.approx(rate / (1 + rate * dead), rel=0.002)
+
+
+@pytest.mark.parametrize(("n", "ripple"), [(3, 0.01), (5, 0.004), (5, 0.01)])
+def test_a_ripple_locks_pixels_to_whole_intervals_and_leaves_the_mean_rate(n, ripple):
+    """Pixels whose charge takes 1 / x ticks lock where |1 / x - n| < ripple / x: no phase is pushed farther back."""
+    intervals = np.linspace(n - 0.5, n + 0.5, 1201)
+    light = (1 / intervals / 0.6)[None].astype(np.float32)
+    ticks, sensor = 3000, Sensor(clock_ripple=ripple)
+    spikes = stream([light, light], [0, ticks], ticks, sensor, random_charge(1, light.size, [5])).window(1000, ticks)
+    times = [np.flatnonzero(pixel) for pixel in spikes[:, 0].T]
+    locked = np.array([(np.diff(own) == n).all() for own in times])
+    assert locked.mean() == pytest.approx(2 * ripple * n, rel=0.1)  # of one whole tick of intervals
+    found = np.array([(own[-1] - own[0]) / (len(own) - 1) for own in times])
+    assert np.median(np.abs(found - intervals)) < ripple * n / 3  # elsewhere the law of light stays
+    assert found.mean() == pytest.approx(intervals.mean(), rel=1e-3)
 
 
 def interval_variances(sensor, rate=0.1, n=8000):
