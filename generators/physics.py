@@ -159,7 +159,7 @@ class PhysicsOptions:
         read_noise: Standard deviation of the comparator's error in a tick, in thresholds, such as 0.006.
         dead_ticks: Ticks after its charge is full in which a pixel collects no light; 1 in a published calibration.
         clock_ripple: How much more or less charge a spike takes by where in the tick it falls, in thresholds, such as
-            0.007, so that pixels lock to whole intervals.
+            0.008, so that pixels lock to whole intervals.
         light: Share of the light that reaches the sensors, in the clip and at calibration, such as 0.25; above 1
             highlights saturate. The scene's id says how much: -light1of4.
         lost_ticks: Share of the clip's ticks that each camera loses, such as 0.05. The scene lists them as gaps:

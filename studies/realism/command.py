@@ -31,7 +31,7 @@ from spike4dgs.studies.realism.ranks import agreement, prediction_errors
 
 TILE = 40  # px: windows of one square are trained on or tested together
 SHOWN = 8  # features in the table and the plot
-GRID = tuple(product((0.007, 0.008, 0.009), (0.005, 0.0065, 0.008)))  # reset noise, clock ripple, in thresholds
+GRID = tuple(product((0.0075, 0.0085), (0.0065, 0.008, 0.0095)))  # reset noise, clock ripple, in thresholds
 STATISTICS = ("one interval", "intervals two apart", "variance of 1 interval", "variance of 4 intervals")
 STATISTICS += ("variance of 8 intervals", *(f"variance of counts of {n} ticks" for n in w.COUNTS))
 
@@ -115,9 +115,7 @@ def realism(
     if stream.n_ticks < 2 * w.TICKS:
         raise problem(recording, f"{2 * w.TICKS} ticks or more", f"{stream.n_ticks}", "give a longer recording")
     spikes = stream.window(0, 2 * w.TICKS)
-    rate, change = w.changes(spikes)
-    regions = {"still": w.usable(rate) & (change < w.STILL), "moving": w.usable(rate) & (change > w.MOVING)}
-    counterparts: dict[str, Counterpart] = {"still": w.counterpart, "moving": w.moving_counterpart}
+    regions = w.regions_of(spikes)
     corners = {region: w.corners_of(pixels) for region, pixels in regions.items()}
     fitted, corners["still"] = split(corners["still"])  # nothing is fitted to the other squares
     for region, of in (*corners.items(), ("still", fitted)):
@@ -128,10 +126,11 @@ def realism(
     sensors, rng = {"before": sensor_with(0.0, 0.0), "after": found}, np.random.default_rng(seed)
     report: dict[str, Any] = {"reset_noise": found.reset_noise, "clock_ripple": found.clock_ripple, "seed": seed}
     for region, of in corners.items():
+        make: Counterpart = w.moving_counterpart if region == "moving" else w.counterpart
         for name, sensor in sensors.items():
-            made = counterparts[region](spikes, sensor, seed + 10)
+            made = make(spikes, sensor, seed + 10)
             report[f"{region}, {name}"] = compare(w.halves(spikes), made, of).report(rng)
-            again = counterparts[region](np.concatenate(made), sensor, seed + 20)
+            again = make(np.concatenate(made), sensor, seed + 20)
             report[f"{region}, {name}, control"] = compare(made, again, of).report(rng)
     report["ranks"] = _ranks(spikes, regions, sensors, seed)
     write_json(out / "realism.json", report)
@@ -169,7 +168,7 @@ def to_markdown(report: dict[str, Any]) -> str:
     """Return the tables: AUC, features alone and statistics of still windows, and ranks."""
     cases = _cases(report)
     rows = []
-    for region in ("still", "moving"):
+    for region in report["ranks"]["errors"]:
         for name in ("before", "after"):
             found, control = cases[f"{region}, {name}"], cases[f"{region}, {name}, control"]
             rows.append([region, name, str(2 * found["windows"]), _area(found), _area(control)])

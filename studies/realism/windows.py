@@ -27,6 +27,7 @@ RUN_UP = 60  # ticks before a simulated recording
 KEY_TICKS = 10  # between keys of a moving pixel's course
 STILL = 0.010  # most relative change of smoothed quarters; their own noise gives 0.005
 MOVING = 0.04
+_BUSY = 0.1  # share of a row that moves
 _SMOOTH_PX = 4.0
 _RATES = (0.05, 0.95)  # spikes per tick: enough spikes, not saturated
 SPANS, COUNTS = (2, 4, 8), (5, 10, 20)  # intervals, ticks
@@ -46,9 +47,19 @@ def corners_of(pixels: Mask, share: float = 0.9) -> Int64:
     return np.argwhere(full) * SIDE
 
 
-def usable(rate: Float64) -> Mask:
-    """Return which pixels have a rate that windows can be compared at."""
-    return np.asarray((rate > _RATES[0]) & (rate < _RATES[1]))
+def regions_of(spikes: UInt8) -> dict[str, Mask]:
+    """Return the pixels [H, W] of a recording that are compared, by what they see.
+
+    `still`: steady light, in rows in which nothing moves; `beside motion`: steady light in other rows, which share
+    their readout with what moves; `moving`. All at rates at which windows have enough spikes and are not saturated, and
+    off the chip's edges, whose rows may be copies of others.
+    """
+    rate, change = changes(spikes)
+    usable = (rate > _RATES[0]) & (rate < _RATES[1])
+    usable[:SIDE] = usable[-SIDE:] = usable[:, :SIDE] = usable[:, -SIDE:] = False
+    busy = (change > MOVING).mean(1, keepdims=True) > _BUSY
+    still = usable & (change < STILL)
+    return {"still": still & ~busy, "beside motion": still & busy, "moving": usable & (change > MOVING)}
 
 
 def stream_of(spikes: UInt8) -> SpikeStream:

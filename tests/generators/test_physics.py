@@ -208,10 +208,11 @@ def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(tmp_path, mon
 
 def test_a_scenes_description_states_what_the_sensor_does(tmp_path, monkeypatch):
     render_fakes(monkeypatch)
-    made = job(dead_ticks=1, read_noise=0.006, reset_noise=0.0009)
+    made = job(dead_ticks=1, read_noise=0.006, reset_noise=0.0009, clock_ripple=0.008)
     scene = open_scene(Maker(made, tmp_path, plain).make())
     sensor, training = scene.meta["sensor"], scene.training
     assert (sensor["dead_ticks"], sensor["read_noise"], sensor["reset_noise"]) == (1, 0.006, 0.0009)
+    assert sensor["clock_ripple"] == sensor_of(made, cameras_of(made)[0]).clock_ripple == 0.008
     known = [*training.streams, *(x for r in training.recordings for x in (r.flat, r.dark))]
     assert {x.dead_ticks for x in known} == {1.0}, "methods know the law"
     assert not {"dead_ticks", "psf_px"} & set(open_scene(Maker(JOB, tmp_path, plain).make()).meta["sensor"])
