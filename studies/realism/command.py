@@ -32,8 +32,12 @@ from spike4dgs.studies.realism.ranks import agreement, prediction_errors
 TILE = 40  # px: windows of one square are trained on or tested together
 SHOWN = 8  # features in the table and the plot
 GRID = tuple(product((0.0075, 0.0085), (0.0065, 0.008, 0.0095)))  # reset noise, clock ripple, in thresholds
-STATISTICS = ("one interval", "intervals two apart", "variance of 1 interval", "variance of 4 intervals")
-STATISTICS += ("variance of 8 intervals", *(f"variance of counts of {n} ticks" for n in w.COUNTS))
+STATISTICS = (
+    "one interval",
+    "intervals two apart",
+    *(f"variance of {n} interval{'s' * (n > 1)}" for n in (1, 4, 8)),
+    *(f"variance of counts of {n} ticks" for n in w.COUNTS),
+)
 
 Counterpart = Callable[[UInt8, Sensor, int], list[UInt8]]
 
