@@ -67,7 +67,10 @@ GROUP = Group(
 
 
 def conditions_block(records: Sequence[Record]) -> list[str]:
-    """Return the lines of the table: PSNR without a condition, and what each one changes, in dB, by row."""
+    """Return the lines of the table: PSNR without a condition, and what each one changes, in dB, by row.
+
+    Conditions that no row was measured under in both worlds are left out.
+    """
     own = of_group(GROUP, records)
     if not own:
         return [NOTHING]
@@ -78,6 +81,7 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
     lines += [
         [c.name, f"`{c.options}`", *(_text(_means(scores, row, c), _means(scores, row, first)) for row in rows)]
         for c in others
+        if any(_means(scores, row, c) for row in rows)
     ]
     heads = ("condition", "options of `make-dataset`", *(f"`{row}`" for row in rows))
     legend = (

@@ -211,8 +211,8 @@ def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_wor
     first, lens, blur = (condition.scenes for condition in CONDITIONS[:3])
     found = [record(OURS, s, 30.0 + k) for k, s in enumerate(first)]
     found += [record(OURS, s, 29.0 - k) for k, s in enumerate(lens)]
-    found += [record(OURS, blur[0], 25.0)]
+    found += [record(OURS, blur[0], 25.0), record("tfp+stg", first[0], 25.0)]
     lines = conditions_block(found)
-    assert lines[2] == "| none |  | 32.50 / 30.50 |"
-    assert lines[3].endswith("| -2.00 / -2.00 |") and lines[4].endswith("| - |")
-    assert "5 of 168 planned cells" in lines[-1]
+    assert lines[2] == "| none |  | 32.50 / 30.50 | - |"
+    assert lines[3].endswith("| -2.00 / -2.00 | - |") and not lines[4], "the blur has been measured in one world"
+    assert "6 of 168 planned cells" in lines[-1]
