@@ -85,7 +85,7 @@ def test_a_scene_killed_on_two_workers_is_finished_by_a_cluster(whole, tmp_path)
 
     kill_when(start(tmp_path, "--workers", "2"), "keys/0*.npz", tmp_path / ".work/car-0-tiny", 2)
     assert not (tmp_path / "car-0-tiny").exists()
-    quiet = {"processes": True, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    quiet = {"processes": True, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": ":0"}
     with LocalCluster(**quiet, silence_logs=50) as cluster:
         output, _ = (process := start(tmp_path, "--scheduler", cluster.scheduler_address)).communicate(timeout=300)
     assert process.returncode == 0, output.decode()
