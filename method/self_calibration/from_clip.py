@@ -10,14 +10,11 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-import numpy as np
-
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.self_calibration.dark_drift import in_todays_dark
-from spike4dgs.method.self_calibration.pose_adjustment import AdjustSettings, adjust, find_tracks
-from spike4dgs.method.self_calibration.poses import LEAST_POINTS, mean_images
+from spike4dgs.method.self_calibration.pose_adjustment import AdjustSettings
+from spike4dgs.method.self_calibration.poses import check_poses
 from spike4dgs.method.starts.structure_from_motion import FEATURES, FeatureSettings
-from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 
 # A calibrated array: 0.2 px of a camera 200 px wide, and centres to a two-thousandth of the largest distance. Weaker
 # knowledge lets turns and shifts of a narrow array explain one another, and adds 0.07 px to poses that were right.
@@ -42,16 +39,10 @@ def at_mended_poses(scene: TrainingScene, seed: int) -> TrainingScene:
     """
     if len(scene.streams) < 2 or min(scene.cameras[0].width, scene.cameras[0].height) < LEAST_PX:
         return scene
-    seen = as_pinholes(scene)
-    images, fixed = mean_images(seen), [False] * len(seen.cameras)
     for features in (FEW, FEATURES):
-        tracks = find_tracks(seen.cameras, images, seed, features)
-        if tracks.points < LEAST_POINTS:
+        found = check_poses(scene, seed, PRIOR, features)
+        if not found.given_px > OFF * found.adjusted_px:  # NaN where views have too few points in common
             return scene
-        given, found = adjust(seen.cameras, tracks, PRIOR, fixed), adjust(seen.cameras, tracks, PRIOR)
-        before, after = (float(np.median(a.errors)) for a in (given, found))
-        if before <= OFF * after:
-            return scene
-    text = f"{tracks.points} points that views have in common miss their features by {before:.2f} px"
-    print(f"the given poses are off: {text}, mended {after:.2f}", file=sys.stderr)
-    return replace(scene, cameras=with_lenses(seen, found.cameras))
+    text = f"{found.points} points that views have in common miss their features by {found.given_px:.2f} px"
+    print(f"the given poses are off: {text}, mended {found.adjusted_px:.2f}", file=sys.stderr)
+    return replace(scene, cameras=found.cameras)

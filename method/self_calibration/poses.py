@@ -13,6 +13,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.self_calibration.clocks import with_camera
 from spike4dgs.method.self_calibration.pose_adjustment import Adjusted, AdjustSettings, adjust, find_tracks
 from spike4dgs.method.starts.clip import window_means
+from spike4dgs.method.starts.structure_from_motion import FEATURES, FeatureSettings
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 
 Float32 = np.typing.NDArray[np.float32]
@@ -41,10 +42,12 @@ class PoseCheck:
         return self.points >= LEAST_POINTS and self.given_px > WRONG * self.adjusted_px
 
 
-def check_poses(scene: TrainingScene, seed: int = 0, s: AdjustSettings = DEFAULTS) -> PoseCheck:
+def check_poses(
+    scene: TrainingScene, seed: int = 0, s: AdjustSettings = DEFAULTS, features: FeatureSettings = FEATURES
+) -> PoseCheck:
     """Return how well the given poses explain what does not move, and poses near them that explain it best."""
     seen = as_pinholes(scene)
-    tracks = find_tracks(seen.cameras, mean_images(seen), seed)
+    tracks = find_tracks(seen.cameras, _means(seen), seed, features)
     if tracks.points < LEAST_POINTS:
         return PoseCheck(tracks.points, np.nan, np.nan, {}, scene.cameras)
     given = adjust(seen.cameras, tracks, s, free=[False] * len(seen.cameras))
@@ -67,14 +70,14 @@ def pose_of_another(
     repaired frame. With too few features in common it is the given one.
     """
     wider = as_pinholes(with_camera(scene, camera, stream, recordings))
-    tracks = find_tracks(wider.cameras, mean_images(wider), seed)
+    tracks = find_tracks(wider.cameras, _means(wider), seed)
     if int((tracks.camera == len(scene.cameras)).sum()) < LEAST_POINTS:
         return camera
     found: Adjusted = adjust(wider.cameras, tracks, s, free=[False] * len(scene.cameras) + [True])
     return with_lenses(wider, found.cameras)[-1]
 
 
-def mean_images(scene: TrainingScene) -> Float32:
+def _means(scene: TrainingScene) -> Float32:
     """Return the mean image of each view over the clip [C, H, W]: what moves is a blur."""
     return window_means(scene, 0, scene.n_ticks, flat_field=bool(scene.calibrations))
 
