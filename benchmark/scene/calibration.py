@@ -56,8 +56,8 @@ def find_recordings(meta: Mapping[str, Any], files: Manifest, camera: str, size:
             found.append(replace(open_counted(files.path(f"{path}.npz"), *size, ticks), dead_ticks=dead))
             continue
         raw = files.path(f"{path}.dat")
-        stream = open_stream(raw, *size, float(meta["rate_hz"]), rows_bottom_up=order, n_ticks=ticks)
-        found.append(replace(stream, dead_ticks=dead))
+        rate_hz = float(meta["rate_hz"])
+        found.append(open_stream(raw, *size, rate_hz, rows_bottom_up=order, n_ticks=ticks, dead_ticks=dead))
     return Recordings(found[0], found[1], float(facts["flat_radiance"]))
 
 

@@ -7,7 +7,7 @@ manifest before it is used, so a damaged stream is refused by whoever reads it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -168,9 +168,16 @@ class Scene(Shown):
         path = self.manifest.path(self.meta["streams"][camera])
         c = self.cameras[camera]
         bottom_up, gaps = bool(self.meta["sensor"]["rows_bottom_up"]), tuple(g for g in self.gaps if g.camera == camera)
-        size = (c.width, c.height)
-        found = open_stream(path, *size, self.rate_hz, rows_bottom_up=bottom_up, n_ticks=self.n_ticks, gaps=gaps)
-        return replace(found, dead_ticks=dead) if (dead := float(self.meta["sensor"].get("dead_ticks", 0))) else found
+        size, dead = (c.width, c.height), float(self.meta["sensor"].get("dead_ticks", 0))
+        return open_stream(
+            path,
+            *size,
+            self.rate_hz,
+            rows_bottom_up=bottom_up,
+            n_ticks=self.n_ticks,
+            gaps=gaps,
+            dead_ticks=dead,
+        )
 
     def recordings(self, camera: str) -> Recordings | None:
         """Return a camera's recordings under uniform light and in the dark; None where the scene has none."""

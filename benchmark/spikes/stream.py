@@ -152,8 +152,9 @@ def open_stream(
     rows_bottom_up: bool = True,
     n_ticks: int | None = None,
     gaps: tuple[Gap, ...] = (),
+    dead_ticks: float = 0.0,
 ) -> SpikeStream:
-    """Memory-map a stream file. `gaps`: the ticks that it lacks by its description.
+    """Memory-map a stream file. `gaps`, `dead_ticks`: what its description says of it, see `SpikeStream`.
 
     Raises UserError where the file is missing, empty, no whole number of ticks, or not `n_ticks` long (if given).
 
@@ -175,7 +176,7 @@ def open_stream(
     if n_ticks is not None and found != n_ticks * size:
         raise problem(path, f"{n_ticks} ticks", f"{found // size}", "the stream is truncated or not this scene's")
     packed = np.memmap(path, dtype=np.uint8, mode="r", shape=(found // size, size))
-    return SpikeStream(packed, width, height, rate_hz, rows_bottom_up, str(path), gaps)
+    return SpikeStream(packed, width, height, rate_hz, rows_bottom_up, str(path), gaps, dead_ticks=dead_ticks)
 
 
 class SpikeWriter:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import tyro
@@ -28,7 +29,7 @@ class Condition:
     name: str
     options: str = ""
 
-    @property
+    @cached_property
     def scenes(self) -> tuple[str, ...]:
         """The ids of its scenes, one for each world."""
         physics = tyro.cli(PhysicsOptions, args=self.options.split()).physics()
@@ -75,13 +76,14 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
     if not own:
         return [NOTHING]
     scores = {(r["row"], r["scene"], m): r["metrics"][m] for r in own if r["error"] is None for m in _METRICS}
-    rows = [row.name for row in GROUP.rows if any(row.name == r["row"] for r in own)]
-    first, *others = CONDITIONS
-    lines = [[first.name, "", *(_text(_means(scores, row, first), None) for row in rows)]]
+    there = {r["row"] for r in own}
+    rows = [row.name for row in GROUP.rows if row.name in there]
+    first, *others = ([_means(scores, row, condition) for row in rows] for condition in CONDITIONS)
+    lines = [[CONDITIONS[0].name, "", *(_text(found, None) for found in first)]]
     lines += [
-        [c.name, f"`{c.options}`", *(_text(_means(scores, row, c), _means(scores, row, first)) for row in rows)]
-        for c in others
-        if any(_means(scores, row, c) for row in rows)
+        [c.name, f"`{c.options}`", *(_text(*pair) for pair in zip(found, first, strict=True))]
+        for c, found in zip(CONDITIONS[1:], others, strict=True)
+        if any(found)
     ]
     heads = ("condition", "options of `make-dataset`", *(f"`{row}`" for row in rows))
     legend = (
