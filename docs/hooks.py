@@ -17,15 +17,6 @@ from mkdocs.exceptions import PluginError
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("benchmark", "generators", "method", "baselines", "leaderboard", "cli", "studies")
 SOURCES = ROOT / "build" / "docs" / "spike4dgs"  # links to the rooms, under the name that they are imported by
-TABLES = ROOT / "docs" / "results" / "tables"
-HEADLINE = (  # columns of the home page's table: key of a cell, title, format
-    ("psnr", "PSNR, dB", ".2f"),
-    ("psnr_dynamic", "PSNR where things move, dB", ".2f"),
-    ("ssim", "SSIM", ".4f"),
-    ("flip", "FLIP (less is better)", ".3f"),
-    ("fit_seconds", "fit, s", ".0f"),
-    ("render_fps", "images/s", ".0f"),
-)
 PAGES = {  # files outside docs/ that have a page on the site
     "CONTRIBUTING.md": "docs/contributing.md",
     "CHANGELOG.md": "docs/changelog.md",
@@ -40,7 +31,6 @@ _NAMES = re.compile(r"^<!-- names of (\w+) -->$", re.MULTILINE)
 _RECIPES = re.compile(r"^<!-- recipes of (\w+) -->$", re.MULTILINE)
 _NOTEBOOK = re.compile(r"^<!-- notebook (\S+) -->$", re.MULTILINE)
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
-_HEADLINE = re.compile(r"^<!-- headline -->$", re.MULTILINE)
 _API = re.compile(r"^<!-- api spike4dgs\.(\w+)\.([\w.]+)((?: \w+)*) -->$", re.MULTILINE)
 
 
@@ -77,14 +67,12 @@ def on_post_build(config: Any, **kwargs: Any) -> None:
 
 
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
-    """Expand the comments `include FILE [SECTION]`, `notebook FILE`, `names of ROOM`, `recipes of ROOM`, `api MODULE`
-    and `headline`."""
+    """Expand the comments `include FILE [SECTION]`, `notebook FILE`, `names of ROOM`, `recipes of ROOM`, `api NAME`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)
     if page.file.src_uri.startswith("results/tables/"):
         markdown += table_images(page.file.src_uri)
         page.meta["search"] = {"boost": 0.2}  # a table has every word of a method's or scene's name
     markdown = _NOTEBOOK.sub(lambda found: notebook(ROOT / found[1]), markdown)
-    markdown = _HEADLINE.sub(lambda found: headline(), markdown)
     markdown = _RECIPES.sub(lambda found: recipe_table(found[1]), markdown)
     markdown = _NAMES.sub(lambda found: name_table(found[1]), markdown)
     return _API.sub(lambda found: api(found[1], found[2], tuple(found[3].split())), markdown)
@@ -138,27 +126,6 @@ def table_images(page: str) -> str:
     files = [f for f in sorted((ROOT / "docs" / page).parent.iterdir()) if f.suffix in (".webp", ".png")]
     shown = [f"### {f.stem.replace('_', ' ').capitalize()}\n\n[![{f.stem}]({f.name})]({f.name})\n" for f in files]
     return "\n".join(["\n\n## Images\n\nSelect an image to see it in full size.\n", *shown]) if shown else ""
-
-
-def headline() -> str:
-    """Return the home page's table: means over the scenes of tables 1 and 2, of our rows and the best of each kind."""
-    tables = [json.loads((TABLES / f"table{number}" / "table.json").read_text(encoding="utf-8")) for number in (1, 2)]
-    cells: dict[str, list[dict[str, Any]]] = {}
-    for row in (row for table in tables for row in table["rows"]):
-        cells.setdefault(row["method"], []).extend(row["scenes"].values())
-    rows = {name: tuple(_mean(found, key) for key, _, _ in HEADLINE) for name, found in cells.items()}
-    kinds = [["spike4dgs-x"], ["spike4dgs"], [n for n in rows if "+" in n], [n for n in rows if n.startswith("dy-")]]
-    chosen = sorted((max(kind, key=lambda name: rows[name][0]) for kind in kinds), key=lambda name: -rows[name][0])
-    lines = ["| method | " + " | ".join(title for _, title, _ in HEADLINE) + " |", "|---" * (1 + len(HEADLINE)) + "|"]
-    for name in chosen:
-        values = [format(value, form) for value, (_, _, form) in zip(rows[name], HEADLINE, strict=True)]
-        lines.append(f"| `{name}` | " + " | ".join(values) + " |")
-    return "\n".join(lines)
-
-
-def _mean(cells: list[dict[str, Any]], key: str) -> float:
-    values = [cell["values"][key]["value"] if key in cell["values"] else cell[key] for cell in cells]
-    return sum(values) / len(values)
 
 
 def recipe_table(room: str) -> str:

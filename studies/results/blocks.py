@@ -37,7 +37,7 @@ def table_block(group: Group, records: Sequence[Record]) -> list[str]:
         if ranking.rows:
             lines += [*markdown(_HEADS, _cells(ranking)), ""]
         lines += _incomplete(rows, own)
-    return [*lines, _LEGEND, "", provenance(group, own)]
+    return [*lines, _LEGEND, "", provenance(own, group)]
 
 
 def scenes_block(group: Group, records: Sequence[Record]) -> list[str]:
@@ -52,7 +52,7 @@ def scenes_block(group: Group, records: Sequence[Record]) -> list[str]:
         heads = ("row", *(scene.partition("-")[0] for scene in group.scenes))
         title = f"**{knowledge.capitalize()}**: PSNR where things move / of the whole image, dB, means over seeds."
         lines += [title, "", *markdown(heads, texts), ""]
-    return [*lines, provenance(group, own)]
+    return [*lines, provenance(own, group)]
 
 
 def lead_block(group: Group, records: Sequence[Record]) -> list[str]:
@@ -69,7 +69,7 @@ def lead_block(group: Group, records: Sequence[Record]) -> list[str]:
         f"Against the best row of others with equal knowledge, in the mean of {len(group.scenes)} scenes. After ± is "
         "half of a 95 % interval of the paired difference over scenes:"
     )
-    return [intro, "", *sentences, "", provenance(group, own)]
+    return [intro, "", *sentences, "", provenance(own, group)]
 
 
 def headline_block(group: Group, records: Sequence[Record]) -> list[str]:
@@ -81,6 +81,23 @@ def headline_block(group: Group, records: Sequence[Record]) -> list[str]:
         for knowledge, rows, rivals in _leaders(group, own)
     ]
     return lines or [NO_LEAD if own else NOTHING]
+
+
+def home_block(records: Sequence[Record]) -> list[str]:
+    """Return a short table of the nine scenes: of each knowledge the best row, the paper's own, the best of others."""
+    own = of_group(NINE, records)
+    ours = {row.name for row in NINE.rows if row.ours}
+    lines = []
+    for knowledge, _, ranking in _blocks(NINE, own):
+        kinds = (
+            [row for row in ranking.rows if row.name in ours and row.name.startswith("spike4dgs-x")],
+            [row for row in ranking.rows if row.name == "spike4dgs"],
+            [row for row in ranking.rows if row.name not in ours],
+        )
+        lines += [[f"`{rows[0].name}`", knowledge, *_scores(rows[0])] for rows in kinds if rows]
+    heads = ("row", "given", "PSNR, dB", "PSNR where things move, dB", "SSIM", "FLIP (less is better)")
+    commits = ", ".join(sorted({_commit(r) for r in own}))
+    return [*markdown(heads, lines), "", f"Commit {commits}; {_processors(own)}."] if lines else [NOTHING]
 
 
 def of_group(group: Group, records: Iterable[Record]) -> list[Record]:
@@ -135,6 +152,10 @@ def _cells(ranking: Ranking) -> list[list[str]]:
     ]
 
 
+def _scores(row: MeasuredRow) -> list[str]:
+    return [_text(row.mean(m), digits) for m, digits in (("psnr", 2), (RANKED_BY, 2), ("ssim", 4), ("flip", 3))]
+
+
 def _text(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
@@ -181,22 +202,26 @@ def _incomplete(rows: Sequence[MeasuredRow], own: Iterable[Record]) -> list[str]
     return [f"Incomplete, not ranked: {', '.join(texts)}.", ""] if texts else []
 
 
-def provenance(group: Group, own: Sequence[Record]) -> str:
+def provenance(own: Sequence[Record], *groups: Group) -> str:
     """Return one paragraph: commits, scenes, processors, seeds, budget, how many of the planned cells, tuning."""
     measured = [r for r in own if r["error"] is None]
     seeds = sorted({r["seed"] for r in measured})
     scenes = {r["scene"]: r["revision"] for r in own}
-    planned = len(cells_of([group]))
+    planned = len(cells_of(groups))
     commits = sorted({_commit(r) for r in own})
     facts = [
         f"Commit{'s' * (len(commits) > 1)} {', '.join(commits)}",
         f"revisions of {len(scenes)} scenes {sha256_json(scenes)[:DIGITS]}",
-        " and ".join(sorted({r["cpu"] for r in own})),
+        _processors(own),
         f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds)) or '-'}",
-        f"budget {group.budget}",
+        f"budget {groups[0].budget}",
         f"{len(measured)} of {planned} planned cells",
     ]
     return " ".join([f"{'; '.join(facts)}.", *_mixed_code(own), _tuning(own)])
+
+
+def _processors(own: Iterable[Record]) -> str:
+    return " and ".join(sorted({r["cpu"] for r in own}))
 
 
 def _commit(record: Record) -> str:

@@ -90,7 +90,7 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         "others its change."
     )
-    return [*markdown(heads, lines), "", legend, "", provenance(GROUP, own)]
+    return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP)]
 
 
 Means = tuple[float, float] | None

@@ -9,22 +9,29 @@ from pathlib import Path
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.studies.kit.blocks import pattern
-from spike4dgs.studies.results.blocks import NINE, headline_block, lead_block, scenes_block, table_block
+from spike4dgs.studies.results.blocks import NINE, headline_block, home_block, lead_block, scenes_block, table_block
 from spike4dgs.studies.results.conditions import conditions_block
-from spike4dgs.studies.results.plan import TABLE1, TABLE2
-from spike4dgs.studies.results.published import published_block
+from spike4dgs.studies.results.plan import TABLE1, TABLE2, TABLE3, TABLE4, TABLE7
+from spike4dgs.studies.results.published import pairs_block, published_block, unposed_block, views_block
 from spike4dgs.studies.results.records import Record
 
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
     "conditions": conditions_block,
     "headline": lambda records: headline_block(NINE, records),
+    "home": home_block,
     "lead": lambda records: lead_block(NINE, records),
     "nine-scenes": lambda records: table_block(NINE, records),
-    "published": published_block,
+    "pairs": pairs_block,
+    "published": lambda records: published_block(TABLE1, 1, records),
     "table1": lambda records: table_block(TABLE1, records),
     "table1-scenes": lambda records: scenes_block(TABLE1, records),
     "table2": lambda records: table_block(TABLE2, records),
     "table2-scenes": lambda records: scenes_block(TABLE2, records),
+    "table3": lambda records: published_block(TABLE3, 3, records),
+    "table4": lambda records: published_block(TABLE4, 4, records),
+    "table5": views_block,
+    "table7": lambda records: published_block(TABLE7, 7, records),
+    "unposed": unposed_block,
 }
 
 BLOCK = pattern("records")
@@ -33,7 +40,8 @@ _MARKER = re.compile(r"^<!-- (?:records: .*|end records) -->$", re.MULTILINE)
 
 def pages_of(root: Path) -> list[Path]:
     """Return the pages of a checkout that figures of quality stand on."""
-    return [root / "README.md", *sorted((root / "docs" / "results").glob("*.md"))]
+    docs = root / "docs"
+    return [root / "README.md", docs / "index.md", *sorted((docs / "results").glob("*.md"))]
 
 
 def with_blocks(text: str, records: Sequence[Record], where: Path | str) -> str:

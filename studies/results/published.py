@@ -1,39 +1,139 @@
-"""The paper's table 1 beside the sweep's: the order of its rows, as its scenes are not available."""
+"""The paper's tables beside the sweep's: the order of rows, as its scenes are not available."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.reports.paper_tables import published, ranks
+from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published, ranks
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, of_group, provenance
-from spike4dgs.studies.results.comparison import rows_of
-from spike4dgs.studies.results.plan import TABLE1
+from spike4dgs.studies.results.blocks import NINE, NOTHING, of_group, provenance
+from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
+from spike4dgs.studies.results.plan import TABLE1, TABLE5, UNPOSED, Group
 from spike4dgs.studies.results.records import Record
 
 _METRICS = {"psnr": 2, "ssim": 4}  # both in the paper and in records -> digits
+_IMAGES = ("tfi", "tfp", "spk2img")  # of the paper's two-stage rows
+_MOTIONS = ("d3dgs", "stg", "4dgs")
+_GIVEN = {"spike4dgs-uncalibrated": "spike4dgs"}  # a row that estimates poses -> the one that is given them
 
 
-def published_block(records: Sequence[Record]) -> list[str]:
-    """Return the lines of the comparison: the paper's rows that are measured on all scenes, best first."""
+def published_block(group: Group, number: int, records: Sequence[Record]) -> list[str]:
+    """Return the lines of a comparison: the table's rows that are measured on all scenes, best first.
+
+    Ranks are among the rows that the paper has.
+    """
+    table, own = published(number), of_group(group, records)
+    rows = [
+        row
+        for row in rows_of([name for name in table.rows if name in _names(group)], group.scenes, own)
+        if row.is_complete
+    ]
+    in_paper = [row for row in rows if table.rows[row.name]]
+    if not in_paper:
+        return [NOTHING]
+    rows.sort(key=lambda row: -(row.mean("psnr") or 0.0))
+    columns, agreement = [], []
+    for metric, digits in _METRICS.items():
+        column, tau = _compared(table, rows, metric, digits)
+        columns.append(column)
+        agreement += [tau] if tau else []
+    moving = [f"{row.mean(RANKED_BY):.2f}" for row in rows]
+    lines = [
+        [f"`{row.name}`", text, *of_psnr, *of_ssim]
+        for row, text, of_psnr, of_ssim in zip(rows, moving, *columns, strict=True)
+    ]
+    heads = ("row", "PSNR, moving", "PSNR", "published", "rank / published", "SSIM", "published", "rank / published")
+    tau = [f"Kendall's tau with the published order: {', '.join(agreement)}.", ""] if agreement else []
+    measured = [r for r in own if r["row"] in {row.name for row in rows}]
+    return [*markdown(heads, lines), "", *tau, provenance(measured, group)]
+
+
+def _compared(
+    table: PublishedTable, rows: Sequence[MeasuredRow], metric: str, digits: int
+) -> tuple[list[list[str]], str]:
+    """Return for each row its mean, the published one, and both ranks; and Kendall's tau, if there are two rows."""
     from scipy.stats import kendalltau
 
-    table, own = published(1), of_group(TABLE1, records)
-    names = [name for name, values in table.rows.items() if values]
-    rows = [row for row in rows_of(names, TABLE1.scenes, own) if row.is_complete]
+    ours, theirs = [row.mean(metric) for row in rows], [table.mean(row.name, metric) for row in rows]
+    known = [mean if printed is not None else None for mean, printed in zip(ours, theirs, strict=True)]
+    parts = zip(ours, theirs, ranks(known, METRICS[metric]), ranks(theirs, METRICS[metric]), strict=True)
+    column = [
+        [f"{mean:.{digits}f}", "", ""]
+        if printed is None
+        else [f"{mean:.{digits}f}", f"{printed:.{digits}f}", f"{rank} / {printed_rank}"]
+        for mean, printed, rank, printed_rank in parts
+    ]
+    pairs = [(a, b) for a, b in zip(known, theirs, strict=True) if a is not None]
+    if len(pairs) < 2:
+        return column, ""
+    return column, f"{METRICS[metric].title} {kendalltau(*zip(*pairs, strict=True)).statistic:.2f}"
+
+
+def unposed_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of table 1 with estimated poses, each row beside the one that is given them."""
+    own = of_group(UNPOSED, records)
+    rows = [row for row in rows_of(_names(UNPOSED), UNPOSED.scenes, own) if row.is_complete]
     if not rows:
         return [NOTHING]
-    columns, taus = [], []
-    for metric, digits in _METRICS.items():
-        ours, theirs = [row.mean(metric) for row in rows], [table.mean(row.name, metric) for row in rows]
-        pairs = zip(ours, ranks(ours, METRICS[metric]), ranks(theirs, METRICS[metric]), strict=True)
-        columns.append([[f"{value:.{digits}f}", f"{rank} / {printed}"] for value, rank, printed in pairs])
-        if len(rows) > 1:
-            taus.append(f"{METRICS[metric].title} {kendalltau(ours, theirs).statistic:.2f}")
-    lines = [[f"`{row.name}`", *of_psnr, *of_ssim] for row, of_psnr, of_ssim in zip(rows, *columns, strict=True)]
-    lines.sort(key=lambda line: int(line[2].split()[0]))
-    heads = ("row", "PSNR", "rank / published", "SSIM", "rank / published")
-    agreement = [f"Kendall's tau with the published order: {', '.join(taus)}.", ""] if taus else []
-    measured = [r for r in own if r["row"] in {row.name for row in rows}]
-    return [*markdown(heads, lines), "", *agreement, provenance(TABLE1, measured)]
+    partners = {row.name: _GIVEN.get(row.name, row.name.replace("+colmap", "")) for row in rows}
+    given = {row.name: row for row in rows_of(partners.values(), TABLE1.scenes, of_group(TABLE1, records))}
+    rows.sort(key=lambda row: -(row.mean(RANKED_BY) or 0.0))
+    lines = []
+    for row in rows:
+        partner = given[partners[row.name]]
+        known = partner.is_complete
+        lost = [f"{row.mean(m) - partner.mean(m):+.2f}" for m in ("psnr", RANKED_BY)] if known else ["-"]
+        lines.append([f"`{row.name}`", _both(row), f"{row.mean('ssim'):.4f}", f"`{partner.name}`", " / ".join(lost)])
+    heads = ("row", "PSNR / moving", "SSIM", "given poses", "change of PSNR / moving, dB")
+    return [*markdown(heads, lines), "", provenance(own, UNPOSED)]
+
+
+def views_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of table 5: PSNR of the whole image and where things move, by the number of training views."""
+    own = [of_group(group, records) for group in TABLE5]
+    measured = [rows_of(_names(group), group.scenes, found) for group, found in zip(TABLE5, own, strict=True)]
+    lines = [
+        [f"`{rows[0].name}`", *(_both(row) if row.is_complete else "-" for row in rows)]
+        for rows in zip(*measured, strict=True)
+        if any(row.is_complete for row in rows)
+    ]
+    if not lines:
+        return [NOTHING]
+    heads = ("training views", *(group.split.partition("-")[2] for group in TABLE5))
+    every = [r for found in own for r in found]
+    return [*markdown(heads, lines), "", provenance(every, *TABLE5)]
+
+
+def pairs_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of two comparisons over the nine scenes: motions with equal images, images with equal motion."""
+    own = of_group(NINE, records)
+    names = [f"{images}+{motion}" for images in _IMAGES for motion in _MOTIONS]
+    rows = {row.name: row for row in rows_of(names, NINE.scenes, own) if row.is_complete}
+    pairs = [(f"{images}+stg", f"{images}+{motion}") for images in _IMAGES for motion in ("4dgs", "d3dgs")]
+    pairs += [(f"tfp+{motion}", f"tfi+{motion}") for motion in _MOTIONS]
+    lines = [_pair(rows[a], rows[b]) for a, b in pairs if a in rows and b in rows]
+    if not lines:
+        return [NOTHING]
+    heads = ("row", "against", "PSNR, dB", "scenes ahead", "where things move, dB", "scenes ahead")
+    measured = [r for r in own if r["row"] in rows]
+    return [*markdown(heads, lines), "", provenance(measured, NINE)]
+
+
+def _pair(one: MeasuredRow, other: MeasuredRow) -> list[str]:
+    """Return a line: by how much the first is ahead in the mean, and on how many scenes."""
+    texts = []
+    for metric in ("psnr", RANKED_BY):
+        each = [
+            a.mean() - b.mean() for a, b in zip(one.values(metric) or (), other.values(metric) or (), strict=True)
+        ]  # fmt: skip
+        texts += [f"{sum(each) / len(each):+.2f}", str(sum(x > 0 for x in each))]
+    return [f"`{one.name}`", f"`{other.name}`", *texts]
+
+
+def _both(row: MeasuredRow) -> str:
+    return f"{row.mean('psnr'):.2f} / {row.mean(RANKED_BY):.2f}"
+
+
+def _names(group: Group) -> list[str]:
+    return [row.name for row in group.rows]

@@ -22,8 +22,17 @@ from spike4dgs.studies.results.conditions import CONDITIONS, WORLDS, conditions_
 from spike4dgs.studies.results.conditions import GROUP as ON_CONDITIONS
 from spike4dgs.studies.results.pages import BLOCKS
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row
-from spike4dgs.studies.results.published import published_block
+from spike4dgs.studies.results.published import pairs_block, published_block, unposed_block, views_block
 
+SHOWN = {  # a block -> two rows that it has, if not those of the tables
+    "published": ("spike4dgs", "tfp+stg"),
+    "table3": ("spike4dgs", "tfp+4dgs"),
+    "table4": ("spike4dgs", "msdi+4dgs"),
+    "table5": ("spike4dgs", "tfi+stg"),
+    "table7": ("spike4dgs", "msdi+4dgs"),
+    "unposed": ("spike4dgs-uncalibrated", "tfp+colmap+stg"),
+    "pairs": ("tfp+stg", "tfp+4dgs"),
+}
 SCENES = ("bricks-0-small", "chips-0-small", "turntable-0-small", "bird-0-small")
 OURS = "spike4dgs-x"
 GROUP = Group("made", "Made", SCENES, (Row(OURS, 2, "here", True), Row("a"), Row("b"), Row("c"), Row("tfp+stg")))
@@ -186,8 +195,9 @@ def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
     assert BLOCKS[name]([]) == [NOTHING]
     scenes = {"conditions": ON_CONDITIONS, "table2": TABLE2}.get(name.removesuffix("-scenes"), NINE).scenes
-    rows = ("spike4dgs", "tfp+stg") if name == "published" else ("spike4dgs-x", "tfp+rig-flat+stg")
-    text = "\n".join(BLOCKS[name]([record(row, s, 30 + k) for row in rows for k, s in enumerate(scenes)]))
+    rows = SHOWN.get(name, ("spike4dgs-x", "tfp+rig-flat+stg"))
+    split = {"split": "views-3"} if name == "table5" else {}
+    text = "\n".join(BLOCKS[name]([record(row, s, 30 + k, **split) for row in rows for k, s in enumerate(scenes)]))
     assert all(f"`{row}`" in text for row in rows) and "c0ffee000000" in text
 
 
@@ -196,13 +206,39 @@ def test_the_order_of_the_paper_stands_beside_ours_for_complete_rows_of_both():
     ours = {"tfp+4dgs": 34.0, "tfp+stg": 35.0, "tfp+d3dgs": 31.0, "spike4dgs-x": 40.0}
     found = [record(row, s, value) for row, value in ours.items() for s in TABLE1.scenes]
     found += [record("tfi+stg", TABLE1.scenes[0], 39.0)]
-    lines = published_block(found)
-    assert lines[2:5] == [
-        "| `tfp+stg` | 37.00 | 1 / 2 | 0.9700 | 1 / 2 |",
-        "| `tfp+4dgs` | 36.00 | 2 / 1 | 0.9700 | 1 / 1 |",
-        "| `tfp+d3dgs` | 33.00 | 3 / 3 | 0.9700 | 1 / 3 |",
+    lines = published_block(TABLE1, 1, found)
+    assert lines[2:6] == [
+        "| `spike4dgs-x` | 40.00 | 42.00 |  |  | 0.9700 |  |  |",
+        "| `tfp+stg` | 35.00 | 37.00 | 24.91 | 1 / 2 | 0.9700 | 0.8512 | 1 / 2 |",
+        "| `tfp+4dgs` | 34.00 | 36.00 | 26.39 | 2 / 1 | 0.9700 | 0.8868 | 1 / 1 |",
+        "| `tfp+d3dgs` | 31.00 | 33.00 | 20.36 | 3 / 3 | 0.9700 | 0.7688 | 1 / 3 |",
     ]
-    assert lines[6].startswith(f"Kendall's tau with the published order: PSNR {(2 - 1) / 3:.2f}")
+    assert lines[7].startswith(f"Kendall's tau with the published order: PSNR {(2 - 1) / 3:.2f}")
+    assert "15 of" in lines[9] or "20 of" in lines[9]
+
+
+def test_estimated_poses_stand_beside_given_ones_where_both_are_measured():
+    rows = {"tfp+stg": 30.0, "tfp+colmap+stg": 29.5, "spike4dgs": 34.0, "spike4dgs-uncalibrated": 33.75}
+    found = [record(row, s, value) for row, value in rows.items() for s in TABLE1.scenes]
+    found += [record("tfi+colmap+stg", s, 28.0) for s in TABLE1.scenes]
+    assert unposed_block(found)[2:5] == [
+        "| `spike4dgs-uncalibrated` | 35.75 / 33.75 | 0.9700 | `spike4dgs` | -0.25 / -0.25 |",
+        "| `tfp+colmap+stg` | 31.50 / 29.50 | 0.9700 | `tfp+stg` | -0.50 / -0.50 |",
+        "| `tfi+colmap+stg` | 30.00 / 28.00 | 0.9700 | `tfi+stg` | - |",
+    ]
+
+
+def test_table_5_has_a_column_for_each_number_of_views():
+    found = [record("spike4dgs", "turntable-0-small", 30.0 + n, split=f"views-{n}") for n in (3, 4, 8)]
+    lines = views_block([*found, record("spike4dgs", "turntable-0-small", 50.0)])
+    assert lines[0] == "| training views | 3 | 4 | 5 | 6 | 7 | 8 |"
+    assert lines[2] == "| `spike4dgs` | 35.00 / 33.00 | 36.00 / 34.00 | - | - | - | 40.00 / 38.00 |"
+
+
+def test_pairs_count_the_scenes_on_which_the_first_is_ahead():
+    found = [record("tfp+stg", s, 30.0 + k) for k, s in enumerate(NINE.scenes)]
+    found += [record("tfp+4dgs", s, 32.0 + 0.5 * k) for k, s in enumerate(NINE.scenes)]
+    assert pairs_block(found)[2] == "| `tfp+stg` | `tfp+4dgs` | +0.00 | 4 | +0.00 | 4 |"
 
 
 def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_worlds_are_measured():

@@ -72,7 +72,8 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A checkout with one page and a ratchet."""
     (tmp_path / "docs" / "results").mkdir(parents=True)
     (tmp_path / "docs/results/page.md").write_text(PAGE)
-    (tmp_path / "README.md").write_text("Nothing.\n")
+    for page in ("README.md", "docs/index.md"):
+        (tmp_path / page).write_text("Nothing.\n")
     (tmp_path / "studies" / "results").mkdir(parents=True)
     (tmp_path / "studies/results/loose_figures.json").write_text('{"docs/results/page.md": 2, "README.md": 1}')
     monkeypatch.setattr(code_state, "ROOT", tmp_path)

@@ -14,12 +14,16 @@ from spike4dgs.generators.make_dataset import SceneSettings, track_jobs
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.tuned import SUFFIX as TUNED
 from spike4dgs.studies.results.plan import (
+    ABLATIONS,
     CALIBRATED,
+    OUR_TRIALS,
     PLAN,
     TABLE1,
     TABLE2,
+    TABLE5,
     TRIAL,
     UNCALIBRATED,
+    UNPOSED,
     Group,
     cells_of,
     knowledge_of,
@@ -36,7 +40,7 @@ ABOUT = {
 }
 
 
-@pytest.mark.parametrize("group", [*PLAN, TRIAL], ids=lambda g: g.name)
+@pytest.mark.parametrize("group", [*PLAN, *ABLATIONS, TRIAL], ids=lambda g: g.name)
 def test_every_row_is_a_method_and_stands_once(group: Group) -> None:
     names = [row.name for row in group.rows]
     assert len(names) == len(set(names)) and set(names) <= set(METHODS)
@@ -89,3 +93,13 @@ def test_cells_stand_once_and_what_matters_most_comes_first() -> None:
     assert [name for name, _ in order[:9]] == first
     assert [seed for _, seed in order] == sorted(seed for _, seed in order)
     assert {name for name, seed in order if seed == 2} >= {"spike4dgs-x", "spike4dgs", "tfp+rig-flat+stg", "tfp+stg"}
+
+
+def test_ablations_have_the_rows_of_the_paper_that_need_no_other_weights() -> None:
+    for group, number in zip(ABLATIONS[:3], (3, 4, 7), strict=True):
+        assert [r.name for r in group.rows] == [name for name in published(number).rows if "dust3r" not in name]
+    assert [group.split for group in TABLE5] == [f"views-{n}" for n in range(3, 9)]
+    assert {group.scenes for group in TABLE5} == {("turntable-0-small",)}
+    tuned_on = {row.name: row.tuned_on for group in ABLATIONS for row in group.rows}
+    assert {tuned_on[name] for name in ("msdi+colmap+4dgs", "spike4dgs-x+colmap", "spike4dgs")} == {OUR_TRIALS}
+    assert tuned_on["tfp+colmap+stg"] != OUR_TRIALS and len(UNPOSED.rows) == 14
