@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from statistics import fmean
 
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published, ranks
@@ -82,8 +83,8 @@ def unposed_block(records: Sequence[Record]) -> list[str]:
     lines = []
     for row in rows:
         partner = given[partners[row.name]]
-        known = partner.is_complete
-        lost = [f"{row.mean(m) - partner.mean(m):+.2f}" for m in ("psnr", RANKED_BY)] if known else ["-"]
+        changes = [_differences(row, partner, metric) for metric in ("psnr", RANKED_BY)] if partner.is_complete else []
+        lost = [f"{fmean(each):+.2f}" for each in changes] or ["-"]
         lines.append([f"`{row.name}`", _both(row), f"{row.mean('ssim'):.4f}", f"`{partner.name}`", " / ".join(lost)])
     heads = ("row", "PSNR / moving", "SSIM", "given poses", "change of PSNR / moving, dB")
     return [*markdown(heads, lines), "", provenance(own, UNPOSED)]
@@ -123,12 +124,15 @@ def pairs_block(records: Sequence[Record]) -> list[str]:
 def _pair(one: MeasuredRow, other: MeasuredRow) -> list[str]:
     """Return a line: by how much the first is ahead in the mean, and on how many scenes."""
     texts = []
-    for metric in ("psnr", RANKED_BY):
-        each = [
-            a.mean() - b.mean() for a, b in zip(one.values(metric) or (), other.values(metric) or (), strict=True)
-        ]  # fmt: skip
-        texts += [f"{sum(each) / len(each):+.2f}", str(sum(x > 0 for x in each))]
+    for each in (_differences(one, other, metric) for metric in ("psnr", RANKED_BY)):
+        texts += [f"{fmean(each):+.2f}", str(sum(x > 0 for x in each))]
     return [f"`{one.name}`", f"`{other.name}`", *texts]
+
+
+def _differences(one: MeasuredRow, other: MeasuredRow, metric: str) -> list[float]:
+    """Return the first's mean over seeds less the other's for each scene of complete rows."""
+    pairs = zip(one.values(metric) or (), other.values(metric) or (), strict=True)
+    return [float(a.mean() - b.mean()) for a, b in pairs]
 
 
 def _both(row: MeasuredRow) -> str:
