@@ -45,9 +45,9 @@ def published_block(group: Group, number: int, records: Sequence[Record]) -> lis
         for row, text, of_psnr, of_ssim in zip(rows, moving, *columns, strict=True)
     ]
     heads = ("row", "PSNR, moving", "PSNR", "published", "rank / published", "SSIM", "published", "rank / published")
-    tau = [f"Kendall's tau with the published order: {', '.join(agreement)}.", ""] if agreement else []
+    taus = [f"Kendall's tau with the published order: {', '.join(agreement)}.", ""] if agreement else []
     measured = [r for r in own if r["row"] in {row.name for row in rows}]
-    return [*markdown(heads, lines), "", *tau, provenance(measured, group)]
+    return [*markdown(heads, lines), "", *taus, provenance(measured, group)]
 
 
 def _compared(
