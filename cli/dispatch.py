@@ -141,11 +141,16 @@ def _bounded(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _numbers(option: str, value: Any) -> Iterator[tuple[str, float]]:
-    """Yield the numbers of an option, which may be a group of options, each with its name."""
+    """Yield the numbers of an option, which may be a group of options, each with its name.
+
+    Without a prefix ("") groups within a group have none either.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         for field in dataclasses.fields(value):
-            name = field.name.replace("_", "-")
-            yield from _numbers(f"{option}.{name}" if option else name, getattr(value, field.name))
+            name, inner = field.name.replace("_", "-"), getattr(value, field.name)
+            yield from _numbers(
+                f"{option}.{name}" if option else "" if dataclasses.is_dataclass(inner) else name, inner
+            )
     elif isinstance(value, tuple | list):
         for item in value:
             yield from _numbers(option, item)

@@ -1,22 +1,46 @@
-"""Write figures of the results pages that no command writes: `python docs/result_figures.py SCENE STRIP OUT`.
+"""Write figures of the results pages that no command writes: `python docs/result_figures.py FIGURE PATHS`.
 
-STRIP is strip_SCENE.png of `speed images`. The files are OUT/images.webp, sensor.webp and uncalibrated.webp.
+images STRIP OUT: of strip_SCENE.png of `speed images`. sensor SCENE OUT. uncalibrated OUT: of the records. sheets SWEEP
+SCENES FOLDER: of the predictions of `report results`, and the scenes of the track `ideal`.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
 from spike4dgs.benchmark import open_scene
+from spike4dgs.benchmark.metrics.image_pair import ImagePair
+from spike4dgs.benchmark.metrics.measure import measure
+from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
+from spike4dgs.benchmark.reports.panels import make_panels
+from spike4dgs.benchmark.reports.sheet import make_sheet
+from spike4dgs.benchmark.scene.images import read_exr
+from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.studies.results.blocks import NINE, of_group
+from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
+from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
+from spike4dgs.studies.results.records import read_records
 
-TABLES = Path(__file__).parent / "results" / "tables"
+RECORDS = Path(__file__).parent.parent / "studies" / "results" / "records"
+SHOWN = (  # rows of a sheet: ours, the best tuned rival, and each kind of the paper's rows
+    "spike4dgs-x",
+    "spike4dgs",
+    "tfp+rig-flat+stg.tuned",
+    "spike4dgs-x+self-calibrated",
+    "spk2img+stg",
+    "tfp+4dgs",
+    "tfi+4dgs",
+    "tfp+d3dgs",
+    "dy-spikenerf",
+)
 COLUMNS = 8  # of the strip: truth and seven image makers
 TFP_TICKS = 40
+SHEET_WIDTH = 1700  # pixels
 
 
 def images(strip: Path, out: Path) -> None:
@@ -52,42 +76,61 @@ def sensor(folder: Path, out: Path) -> None:
 
 
 def uncalibrated(out: Path) -> None:
-    """Show each row's PSNR where things move with given and with estimated poses, from the committed tables."""
-    given, estimated = (_moving(TABLES / name / "table.json") for name in ("table1", "table1_uncalibrated"))
-    # The last rows of table 1 are of later commits than the rows with estimated poses: they are not compared.
-    rows = [(name.replace("+colmap", ""), value) for name, value in estimated.items() if "spike4dgs" not in name]
-    rows = [(name, value) for name, value in rows if given.get(name) is not None and value is not None]
+    """Show each row's PSNR where things move with given and with estimated poses, from the records."""
+    given, estimated = (_moving(group) for group in (TABLE1, UNPOSED))
+    rows = [(name, name.replace("+colmap", ""), value) for name, value in estimated.items() if "+colmap" in name]
+    rows = [(name, value, given[name]) for _, name, value in rows if name in given]
     figure = new_figure((8, 4), "constrained")
     axes = figure.subplots()
-    for y, (name, value) in enumerate(reversed(rows)):
-        axes.plot([given[name], value], [y, y], color="0.6", zorder=1)
-        axes.scatter([given[name]], [y], color="tab:blue", label="given poses" if y == 0 else None)
+    for y, (_, value, known) in enumerate(reversed(rows)):
+        axes.plot([known, value], [y, y], color="0.6", zorder=1)
+        axes.scatter([known], [y], color="tab:blue", label="given poses" if y == 0 else None)
         axes.scatter([value], [y], color="tab:orange", label="poses by COLMAP" if y == 0 else None)
-    axes.set_yticks(range(len(rows)), [name for name, _ in reversed(rows)])
+    axes.set_yticks(range(len(rows)), [name for name, _, _ in reversed(rows)])
     axes.set_xlabel("PSNR where things move, dB: mean of five scenes")
     axes.grid(axis="x", alpha=0.3)
     axes.legend()
     _save(figure, out)
 
 
-def _moving(path: Path) -> dict[str, float | None]:
-    rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
-    return {row["method"]: row["mean"]["psnr_dynamic"]["value"] for row in rows}
+def _moving(group: Group) -> dict[str, float]:
+    own = of_group(group, list(read_records(RECORDS).values()))
+    rows = rows_of([row.name for row in group.rows], group.scenes, own)
+    return {row.name: value for row in rows if (value := row.mean(RANKED_BY)) is not None}
 
 
-def _save(figure: object, out: Path) -> None:
+def sheets(sweep: Path, scenes: Path, out: Path) -> None:
+    """Write a sheet of each of the nine scenes: truth, and what the sweep's fits with seed 0 render."""
+    for name in NINE.scenes:
+        scene = open_scene(scenes / name)
+        found = {row: next(sweep.glob(f"*/quick-center/seed-0/predictions/{row}/{name}"), None) for row in SHOWN}
+        folders = {row: folder for row, folder in found.items() if folder}
+        records = [_scored(row, scene, folder) for row, folder in folders.items()]
+        _save(make_sheet(make_panels(scene, folders, records)), out / f"{name.partition('-')[0]}.webp", SHEET_WIDTH)
+
+
+def _scored(row: str, scene: Scene, folder: Path) -> dict[str, Any]:
+    """Return what a sheet shows of a record: PSNR of each image."""
+    scores = {}
+    for target in scene.targets:
+        truth = scene.ground_truth(target)
+        render = read_exr(folder / f"{target.name}.exr", truth.shape)
+        pair = ImagePair(render, truth, scene.moving(target), target.name)
+        scores[target.name] = measure(pair, None, [METRICS[m] for m in ("psnr", "psnr_dynamic")]).values
+    return {"method": {"name": row}, "scenes": {scene.id: {"status": "ok", "per_image": scores}}}
+
+
+def _save(figure: object, out: Path, width: int | None = None) -> None:
     png = out.with_suffix(".png")
     save_figure(figure, png)  # type: ignore[arg-type]
-    Image.open(png).convert("RGB").save(out, quality=85, method=6)
+    image = Image.open(png).convert("RGB")
+    if width is not None:
+        image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+    image.save(out, quality=85, method=6)
     png.unlink()
 
 
-def main(scene: str, strip: str, out: str) -> None:
-    """Write the three figures."""
-    images(Path(strip), Path(out) / "images.webp")
-    sensor(Path(scene), Path(out) / "sensor.webp")
-    uncalibrated(Path(out) / "uncalibrated.webp")
-
+FIGURES = {"images": images, "sensor": sensor, "uncalibrated": uncalibrated, "sheets": sheets}
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    FIGURES[sys.argv[1]](*map(Path, sys.argv[2:]))

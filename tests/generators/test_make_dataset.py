@@ -11,6 +11,7 @@ from changes import files_in
 from fake_renderer import FakeRenderer, render_fakes
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.cli import main
 from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.make_dataset import make_dataset as command
@@ -195,6 +196,11 @@ def test_bad_arguments_are_one_line(world, options, words, tmp_path):
         make(world, out=tmp_path, **options)
     assert "\n" not in str(e.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_number_that_is_none_is_named_as_the_command_line_has_it(tmp_path, capsys):
+    assert main(["make-dataset", "car", "--light", "nan", "--out", str(tmp_path / "x")]) == 2
+    assert capsys.readouterr().err.startswith("error: --light: expected a number from")
 
 
 def test_a_full_disk_is_noticed_before_work_begins(fake, tmp_path, monkeypatch):
