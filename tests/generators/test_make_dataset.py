@@ -11,9 +11,9 @@ from changes import files_in
 from fake_renderer import FakeRenderer, render_fakes
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.cli import main
 from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.cli import main
 from spike4dgs.cli.make_dataset import make_dataset as command
 from spike4dgs.generators import scene_maker
 from spike4dgs.generators.make_dataset import SceneSettings, make_dataset, track_jobs
