@@ -39,13 +39,17 @@ from spike4dgs.benchmark.weights import WeightsError
 
 @dataclass(frozen=True)
 class Job:
-    """A method on a scene, and everything that decides what comes out."""
+    """A method on a scene, and everything that decides what comes out.
+
+    `refined`: held-out cameras are refined besides, even where the method does not ask for it.
+    """
 
     method: Method
     scene: Scene
     seed: int
     device: str
     budget: Budget
+    refined: bool = False
 
     @property
     def info(self) -> MethodInfo:
@@ -58,13 +62,14 @@ class Job:
 
     @property
     def variants(self) -> tuple[MethodInfo, ...]:
-        """The method as it is, and with refined held-out cameras where it asks for that: one record each.
+        """The method as it is, and with refined held-out cameras where that is asked for: one record each.
 
         Refinement needs the held-out cameras' streams.
         """
         refined = replace(self.info, name=self.method.name + SUFFIX)
+        asked = self.refined or getattr(self.method, "refines_views", False)
         has_streams = set(self.scene.test) <= set(self.scene.meta["streams"])
-        return (self.info, refined) if getattr(self.method, "refines_views", False) and has_streams else (self.info,)
+        return (self.info, refined) if asked and has_streams else (self.info,)
 
     @property
     def key(self) -> str:

@@ -61,6 +61,7 @@ class Order:
     folder: SharedFolder
     work: Path  # of the checkpoint, in the shared folder
     apart: Apart | None = None
+    refined: bool = False
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,7 @@ def make_order(job: Job, folder: SharedFolder, work: Path, apart: Apart | None =
         folder=folder,
         work=work.absolute(),
         apart=apart,
+        refined=job.refined,
     )
 
 
@@ -123,7 +125,7 @@ def _job(order: Order) -> Job:
     try:
         method = unpacked_method(order.method)
         device = choose_device_for([method], order.device)
-        job = Job(method, scene, order.seed, device, order.budget)
+        job = Job(method, scene, order.seed, device, order.budget, order.refined)
         if job.key == order.key:
             return job
         found = "another version of it or of spike4dgs"

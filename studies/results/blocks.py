@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import make_budget
+from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
 from spike4dgs.method.recipes import METHODS as OURS
 from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.kit.timing import markdown
@@ -234,7 +235,8 @@ def _mixed_code(own: Iterable[Record]) -> list[str]:
     by_commit: dict[str, dict[str, None]] = {}
     for r in own:
         # Digests of methods in `method` leave the baselines out; those of tuned rows cover their settings.
-        kind = r["row"] if is_tuned(r["row"]) else "ours" if r["row"] in OURS else "theirs"
+        row = r["row"].removesuffix(REFINED)
+        kind = row if is_tuned(row) else "ours" if row in OURS else "theirs"
         codes.setdefault(kind, set()).add(r["code"])
         by_commit.setdefault(_commit(r), {})[f"`{r['row']}`"] = None
     if all(len(found) <= 1 for found in codes.values()):

@@ -11,6 +11,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import get_method
 from spike4dgs.benchmark.runs.method_code import sources_sha256
+from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
 from spike4dgs.method.recipes import METHODS as OURS
 from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.results.records import DIGITS
@@ -51,6 +52,7 @@ def check_clean(state: CodeState, allow_dirty: bool) -> None:
 
 def code_digest(row: str) -> str:
     """Return a digest of the sources that a row's method and its scores come from, and of searched settings."""
+    row = row.removesuffix(REFINED)
     found = sources_sha256([benchmark, method, *([] if row in OURS else [baselines])])
     if is_tuned(row):
         found = sha256_json([found, get_method(row).params["settings"]])

@@ -6,12 +6,13 @@ Its cells are a group of the sweep's plan. No row was tuned on these variants, w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import tyro
 
+from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NOTHING, of_group, provenance
@@ -24,10 +25,11 @@ _METRICS = ("psnr", "psnr_dynamic")
 
 @dataclass(frozen=True)
 class Condition:
-    """A condition, and the options of `make-dataset` that make it."""
+    """A condition, and the options of `make-dataset` that make it. `refined`: scored at the fitted held-out pose."""
 
     name: str
     options: str = ""
+    refined: bool = False
 
     @cached_property
     def scenes(self) -> tuple[str, ...]:
@@ -41,6 +43,7 @@ CONDITIONS = (
     Condition("lens, known", "--lens -0.2 0.03 --lens-spread 0.5"),
     Condition("blur of 0.5 px", "--psf-px 0.5"),
     Condition("poses 0.1 px off", "--pose-noise-deg 0.025"),
+    Condition("the same, held-out pose refined", "--pose-noise-deg 0.025", refined=True),
     Condition("flicker of 8 %", "--flicker 0.08"),
     Condition("dark rate doubled", "--warming-k 8"),
     Condition("reset and read noise, dead tick", "--reset-noise 0.0009 --read-noise 0.006 --dead-ticks 1"),
@@ -55,7 +58,7 @@ CONDITIONS = (
 GROUP = Group(
     "conditions",
     "Conditions of camera and light",
-    tuple(scene for condition in CONDITIONS for scene in condition.scenes),
+    tuple(dict.fromkeys(scene for condition in CONDITIONS for scene in condition.scenes)),
     (
         Row("spike4dgs-x", 1, OUR_TRIALS, ours=True),
         Row("tfp+rig-flat+stg"),
@@ -64,6 +67,12 @@ GROUP = Group(
         Row("tfp+stg"),
         Row("tfp+4dgs"),
     ),
+)
+REFINED = Group(
+    "conditions-refined",
+    "Conditions, held-out poses refined",
+    tuple(scene for condition in CONDITIONS if condition.refined for scene in condition.scenes),
+    tuple(replace(row, name=f"{row.name}{SUFFIX}") for row in GROUP.rows),
 )
 
 
@@ -75,6 +84,7 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
     own = of_group(GROUP, records)
     if not own:
         return [NOTHING]
+    own += of_group(REFINED, records)
     scores = {(r["row"], r["scene"], m): r["metrics"][m] for r in own if r["error"] is None for m in _METRICS}
     there = {r["row"] for r in own}
     rows = [row.name for row in GROUP.rows if row.name in there]
@@ -90,7 +100,7 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         "others its change."
     )
-    return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP)]
+    return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP, REFINED)]
 
 
 Means = tuple[float, float] | None
@@ -98,7 +108,8 @@ Means = tuple[float, float] | None
 
 def _means(scores: dict[tuple[str, str, str], float], row: str, condition: Condition) -> Means:
     """Return the means of the two metrics over a condition's scenes; None where one was not measured."""
-    found = [[scores.get((row, scene, m)) for scene in condition.scenes] for m in _METRICS]
+    name = f"{row}{SUFFIX}" if condition.refined else row
+    found = [[scores.get((name, scene, m)) for scene in condition.scenes] for m in _METRICS]
     if any(value is None for values in found for value in values):
         return None
     whole, moving = np.array(found, np.float64).mean(axis=1)

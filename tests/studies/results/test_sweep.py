@@ -14,7 +14,8 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
-from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, wait_for
+from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, run, wait_for
+from nosy_methods import Refines
 from rich.console import Console
 from small_scenes import write_small_scene
 
@@ -101,6 +102,17 @@ def test_a_record_says_what_was_measured_of_what(folder: Path) -> None:
     assert {"psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip", "temporal_error"} <= set(record["metrics"])
     predictions = list((folder / "out").rglob("*.exr"))
     assert len(predictions) == 3 and predictions[0].is_relative_to(folder / "out" / record["code"])
+
+
+def test_a_refined_row_is_its_method_scored_at_the_refined_held_out_poses(folder: Path) -> None:
+    """The method renders brighter images at refined poses."""
+    methods = {"refines": Refines(folder / "seen.json")}
+    _, records, _ = swept(folder, cells("refines", "refines.refined"), methods)
+    plain, refined = (next(r for r in records.values() if r["row"] == row) for row in ("refines", "refines.refined"))
+    assert plain["error"] is None and plain["metrics"] != refined["metrics"]
+    assert plain["code"] == refined["code"]
+    (brighter,) = run(folder / "here", [folder / "pattern-0"], Refines(folder / "seen.json"))[1:]
+    assert refined["metrics"]["psnr"] == pytest.approx(brighter["mean"]["psnr"], rel=1e-5)
 
 
 def test_a_failed_cell_says_why_and_is_tried_again(folder: Path) -> None:
