@@ -39,17 +39,14 @@ from spike4dgs.benchmark.weights import WeightsError
 
 @dataclass(frozen=True)
 class Job:
-    """A method on a scene, and everything that decides what comes out.
-
-    `refined`: held-out cameras are refined besides, even where the method does not ask for it.
-    """
+    """A method on a scene, and everything that decides what comes out."""
 
     method: Method
     scene: Scene
     seed: int
     device: str
     budget: Budget
-    refined: bool = False
+    refined: bool = False  # held-out cameras are refined besides, even where the method does not ask for it
 
     @property
     def info(self) -> MethodInfo:
@@ -62,13 +59,10 @@ class Job:
 
     @property
     def variants(self) -> tuple[MethodInfo, ...]:
-        """The method as it is, and with refined held-out cameras where that is asked for: one record each.
-
-        Refinement needs the held-out cameras' streams.
-        """
+        """The method as it is, and with refined held-out cameras where that is asked for: one record each."""
         refined = replace(self.info, name=self.method.name + SUFFIX)
         asked = self.refined or getattr(self.method, "refines_views", False)
-        has_streams = set(self.scene.test) <= set(self.scene.meta["streams"])
+        has_streams = set(self.scene.test) <= set(self.scene.meta["streams"])  # refinement needs them
         return (self.info, refined) if asked and has_streams else (self.info,)
 
     @property
