@@ -34,7 +34,7 @@ def make_dataset(
 
     Args:
         worlds: Names of worlds, such as car turntable.
-        all: Make all worlds.
+        all: Make all worlds but those that are hard by design: appear, beads, blank.
         out: Folder in which the scene folders appear.
         audit: Compare random ticks and ground truth with full renderings of 4 times the samples; see the report.
         replace: Make damaged scenes, and scenes with other settings, again.
@@ -48,7 +48,7 @@ def make_dataset(
 
     if all and worlds:
         raise problem("worlds", "names or --all", "both", "leave one out")
-    names = list(WORLDS if all or (track and not worlds) else dict.fromkeys(worlds))
+    names = list(WORLDS.all_names if all or (track and not worlds) else dict.fromkeys(worlds))
     if not names:
         raise problem("worlds", "at least one world, or --all", "none", f"choose among {', '.join(WORLDS)}")
     chosen = list(names)

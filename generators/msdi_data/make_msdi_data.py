@@ -110,11 +110,11 @@ class MakeBursts:
 
 
 def all_worlds() -> dict[str, World]:
-    """Return the worlds to train on: the benchmark's, and those that are for training only."""
+    """Return the worlds to train on: the benchmark's and other packages', and those that are for training only."""
     from spike4dgs.generators.msdi_data.clutter import TRAINING_WORLDS
     from spike4dgs.generators.worlds import WORLDS
 
-    return {**WORLDS, **TRAINING_WORLDS}
+    return {**{name: WORLDS[name] for name in WORLDS.all_names}, **TRAINING_WORLDS}
 
 
 def _instants(count: int, rng: np.random.Generator) -> list[int]:

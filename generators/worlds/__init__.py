@@ -13,8 +13,9 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.plugins import find_plugins
 from spike4dgs.generators.worlds import bicycle, bird, bricks, car, chips, jaywalk, motor, turntable, van
 from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene, build_at
+from spike4dgs.generators.worlds.hard import appear, beads, blank
 
-__all__ = ["OURS", "WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene", "build_at"]
+__all__ = ["HARD", "OURS", "WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene", "build_at"]
 
 GROUP = "spike4dgs.worlds"
 
@@ -33,17 +34,27 @@ OURS: dict[str, World] = {
     )
 }
 
+HARD: dict[str, World] = {world.name: world for world in (appear.WORLD, beads.WORLD, blank.WORLD)}
+
 
 class Worlds(Mapping[str, World]):
     """The worlds of this package and of all that are installed beside it.
+
+    The benchmark's come first (`OURS`), then those of content that can break a method (`HARD`), which have to be named:
+    they are no part of `all_names`.
 
     Raises UserError where a name is used twice, and where a package cannot be imported or registers something else.
     """
 
     @cached_property
     def _all(self) -> dict[str, World]:
-        found = find_plugins(GROUP, "world", check_world, OURS)
-        return OURS | {name: plugin.value for name, plugin in found.items()}
+        found = find_plugins(GROUP, "world", check_world, OURS | HARD)
+        return OURS | HARD | {name: plugin.value for name, plugin in found.items()}
+
+    @property
+    def all_names(self) -> list[str]:
+        """The worlds that a command makes where none is named: all but `HARD`."""
+        return [name for name in self if name not in HARD]
 
     def __getitem__(self, name: str) -> World:
         return self._all[name]

@@ -20,7 +20,7 @@ from spike4dgs.generators.make_dataset import SceneSettings, make_dataset, track
 from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.profiles import PROFILES, TRACKS, Job
 from spike4dgs.generators.scene_maker import Maker
-from spike4dgs.generators.worlds import WORLDS
+from spike4dgs.generators.worlds import HARD, OURS
 
 JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 
@@ -224,7 +224,7 @@ def test_a_variant_of_seasons_is_named_as_such(fake, tmp_path, capsys):
 
 
 def test_a_track_has_its_variants_of_every_world_and_its_camera(tmp_path):
-    worlds = list(WORLDS)[:9]
+    worlds = list(OURS)
     ids = {name: [job.id for job in track_jobs(name, worlds, SceneSettings())] for name in TRACKS}
     assert len(ids["small"]) == 27 and ids["small"][:3] == [f"jaywalk-{v}-small-realistic" for v in (0, 3, 4)]
     assert len(ids["dev-small"]) == 18 and not set(ids["small"]) & set(ids["dev-small"])
@@ -238,6 +238,17 @@ def test_a_track_has_its_variants_of_every_world_and_its_camera(tmp_path):
     ):
         with pytest.raises(UserError, match=words):
             command(("car",), track=track, settings=settings, out=tmp_path)
+
+
+def test_all_are_the_benchmarks_worlds_and_others_are_named(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        "spike4dgs.generators.make_dataset.make_dataset", lambda jobs, *_, **__: made.append([j.world for j in jobs])
+    )
+    command(all=True, out=tmp_path)
+    command(track="ideal", out=tmp_path)
+    command(tuple(HARD), out=tmp_path)
+    assert made == [list(OURS), list(OURS), list(HARD)] and len(OURS) == 9
 
 
 def test_worlds_are_named_or_all(tmp_path):
