@@ -23,7 +23,7 @@ from spike4dgs.benchmark.screen.bars import Pace, left_text, make_bars, seconds_
 from spike4dgs.benchmark.variants import is_reserved
 from spike4dgs.generators.physics import NO_OPTIONS, PhysicsOptions
 from spike4dgs.generators.profiles import PROFILES, RATE_HZ, SPLIT_PROFILES, TARGET_EVERY, TRACKS, Job
-from spike4dgs.generators.render_tasks import cameras_of
+from spike4dgs.generators.render_tasks import cameras_of, world_of
 from spike4dgs.generators.rendering.mitsuba_variant import pick_variant
 from spike4dgs.generators.scene_check import check_scenes, find_references
 from spike4dgs.generators.scene_maker import Maker
@@ -149,6 +149,9 @@ def make_dataset(
             if chosen.startswith("scalar"):
                 fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
                 raise problem("--lens, --psf-px and --rendering split", "Mitsuba's LLVM or CUDA variant", chosen, fix)
+            if job.profile.soft and len(world_of(job).mirrors):
+                expected = "a world without mirrors, glass and flashes"
+                raise problem("--rendering split", expected, job.world, "make it with --rendering paths")
             for camera in cameras_of(job):
                 check_lens(camera, "--lens")
     with executor(workers, scheduler) as run:

@@ -179,7 +179,7 @@ class Truth(NamedTuple):
     view: int
     tick: int
     rgb: NDArray[np.float32]  # [H, W, 3]
-    mask: NDArray[np.bool_]  # [H, W] where a moving object is visible
+    mask: NDArray[np.bool_]  # [H, W] where a moving object is visible, also in a mirror
     depth: NDArray[np.float32]  # [H, W]
     ids: NDArray[np.uint32]  # [H, W]
     flow: NDArray[np.float32]  # [H, W, 2] px within the next millisecond
@@ -211,7 +211,7 @@ class RenderTargets(_Task):
         t_s, everywhere = tick / RATE_HZ, tick in self.job.sparse_ticks
         renderer = self._every_view if everywhere else self._held_out
         views = range(len(cameras_of(self.job))) if everywhere else [held_out_view(self.job)]
-        images = (renderer.keys(t_s), renderer.object_masks(t_s), *renderer.geometry(t_s, TARGET_EVERY / RATE_HZ))
+        images = (renderer.keys(t_s), renderer.moving_masks(t_s), *renderer.geometry(t_s, TARGET_EVERY / RATE_HZ))
         return [Truth(view, tick, *one) for view, *one in zip(views, *images, strict=True)]
 
 

@@ -21,11 +21,13 @@ def max_image_speed(world: WorldScene, cameras: Sequence[Camera], duration_s: fl
     """Return the speed in px/s of the fastest visible image point over all views and `samples` times of the clip.
 
     Exact from geometry: every vertex of the moving meshes is projected at t and a microsecond later, rotation included.
-    Occlusion is ignored, so the result is an upper bound, reached wherever that vertex is visible.
+    Occlusion is ignored, so the result is an upper bound, reached wherever that vertex is visible. Images in mirrors
+    and panes count as visible too.
     """
     fastest = 0.0
     for t in np.linspace(0.0, duration_s, samples):
-        before, after = world.moving_points(t), world.moving_points(t + _STEP_S)
+        points = world.moving_points(t), world.moving_points(t + _STEP_S)
+        before, after = (np.concatenate([p, *(mirrored(p, plane) for plane in world.mirrors)]) for p in points)
         for camera in cameras:
             uv, z = camera.project(before)
             uv_after, _ = camera.project(after)
@@ -33,6 +35,19 @@ def max_image_speed(world: WorldScene, cameras: Sequence[Camera], duration_s: fl
             speed = np.linalg.norm(uv_after - uv, axis=1)[seen] / _STEP_S
             fastest = max(fastest, float(speed.max(initial=0.0)))
     return fastest
+
+
+def mirrored(points: np.ndarray, planes: np.ndarray) -> np.ndarray:
+    """Return the mirror images of points [N, 3] in planes [4] or [N, 4] (unit normal n, and n.p of its points p)."""
+    n = planes[..., :3]
+    return np.asarray(points - 2 * ((points * n).sum(-1) - planes[..., 3])[..., None] * n)
+
+
+def imaged(points: np.ndarray, planes: Sequence[np.ndarray]) -> np.ndarray:
+    """Return where points [N, 3] seem to be that rays meet after reflection at each of `planes` [N, 4] in turn."""
+    for plane in reversed(planes):
+        points = mirrored(points, plane)
+    return points
 
 
 def carried(world: WorldScene, hits: Hits, points: np.ndarray, from_s: float, to_s: float) -> np.ndarray:

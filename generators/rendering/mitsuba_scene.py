@@ -45,6 +45,8 @@ class Hits(NamedTuple):
 class MitsubaScene:
     """A world in Mitsuba's memory: `empty` (static surfaces), `movers` (moving surfaces, without materials), `full`.
 
+    `opaque` is `empty` without glass. `reflectors` are the mirrors alone and the panes alone; None: there are none.
+
     `full` and `movers` are at the time of the last `set_time`. The moving surfaces are a few plain meshes with updated
     vertices, never Mitsuba's instances: every kernel launch visits each instance, and for a figure of a dozen limbs
     that takes longer than tracing its pixels.
@@ -62,6 +64,14 @@ class MitsubaScene:
         self.empty = mi.load_dict({"type": "scene", **static})
         self.full = mi.load_dict({"type": "scene", **static, **moving})
         self.movers = mi.load_dict({"type": "scene", **plain})
+        mirrors, panes = (
+            {k: p for k, p in world.static.items() if getattr(p.material, kind)} for kind in ("mirror", "glass")
+        )
+        self.reflectors = [
+            mi.load_dict({"type": "scene", **_shapes("plain", some)}) if some else None for some in (mirrors, panes)
+        ]
+        solid = {k: part for k, part in world.static.items() if k not in panes}
+        self.opaque = mi.load_dict({"type": "scene", **_shapes("solid", solid)}) if panes else self.empty
         self._parameters = [mi.traverse(scene) for scene in (self.full, self.movers)]
         # the scalar variants compute their own normals whenever positions are set, so ours have to come after that
         self._own_normals = str(mi.variant()).startswith("scalar")
@@ -166,7 +176,7 @@ def _batches(world: WorldScene) -> dict[str, _Batch]:
         for part in world.groups[group]:
             m = part.material
             image = id(m.albedo) if isinstance(m.albedo, np.ndarray) else None
-            alike.setdefault((image, m.gloss, m.metal, part.mesh.smooth), []).append((number, part))
+            alike.setdefault((image, m.gloss, m.metal, m.glass, part.mesh.smooth), []).append((number, part))
     found = {}
     for k, members in enumerate(alike.values()):
         numbers, parts = zip(*members, strict=True)
@@ -203,7 +213,8 @@ def _in_palettes(parts: Mapping[str, Part]) -> dict[str, Part]:
         if isinstance(part.material.albedo, np.ndarray):
             kept[name] = part
         else:
-            alike.setdefault((part.material.gloss, part.material.metal, part.mesh.smooth), []).append(part)
+            m = part.material
+            alike.setdefault((m.gloss, m.metal, m.glass, part.mesh.smooth), []).append(part)
     return kept | {f"plain{number}": _in_palette(members) for number, members in enumerate(alike.values())}
 
 

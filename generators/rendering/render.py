@@ -5,7 +5,7 @@ Three kinds of pixel, cheapest first:
 - *Static*: the background, rendered once with many samples.
 - *Softly lit* (bounced light, wide penumbrae): the background times a slowly varying factor, see `soft_light`.
 - *Traced* at every key: a ray through the pixel's centre meets a moving object, or the surface that it meets has one
-  between itself and the light; both regions are grown by 3 px (`visibility`).
+  between itself and the light; both regions are grown by 3 px (`visibility`). So are reflections in planar mirrors.
 
 Keys between two coarse ones hold only traced pixels whose motion is too fast for the coarse ones (`image_motion`).
 
@@ -235,7 +235,7 @@ class MultiViewRenderer(Visibility):
         if self.whole_frames:
             return traced
         correction = self._flat(self.background)[where] - self._flat(self._first)[where]
-        correction[self.object_masks(t_s).ravel()[where]] = 0
+        correction[self.moving_masks(t_s).ravel()[where]] = 0
         return np.maximum(traced + correction, 0)
 
     @cached_property

@@ -75,11 +75,15 @@ class TileTracer:
         """Return rays [N, 3] with unit directions, prepared for repeated casts."""
         return origins, directions
 
-    def cast_static(self, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
-        """Cast rays at static surfaces. Return distance [N] (inf: no hit) and surface normal [N, 3], float32."""
+    def cast_static(self, rays: Rays, scene: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Cast rays at a scene: if None, at the static surfaces that are opaque.
+
+        Return distance [N] (inf: no hit) and surface normal [N, 3], float32.
+        """
+        scene = scene or self._scene.opaque
         distance, normal = np.full(len(rays[0]), np.inf, np.float32), np.zeros((len(rays[0]), 3), np.float32)
         for k, (o, d) in enumerate(zip(*(a.tolist() for a in rays), strict=True)):
-            hit = self._scene.empty.ray_intersect(mi.Ray3f(o, d))
+            hit = scene.ray_intersect(mi.Ray3f(o, d))
             if hit.is_valid():
                 distance[k], normal[k] = hit.t, hit.n
         return distance, normal

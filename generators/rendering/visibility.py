@@ -1,7 +1,8 @@
 """Visibility of moving objects: masks, shadows, depth, image motion. Rays only, no light.
 
 All of it is computed at pixel centres. The rays through them, and those from the static surfaces that they meet to the
-main light, never change; so they are prepared once, and at each time cast at the moving objects alone.
+main light, never change; so they are prepared once, and at each time cast at the moving objects alone. So are the rays
+that planar mirrors and panes of glass reflect, twice at most. Glass hides nothing: what is seen is behind it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.generators.rendering.image_motion import carried
+from spike4dgs.generators.rendering.image_motion import carried, imaged, mirrored
 from spike4dgs.generators.rendering.mitsuba_scene import Hits, MitsubaScene
 from spike4dgs.generators.worlds import WorldScene
 
@@ -24,14 +25,32 @@ _TICK_S = 5e-5  # over which, to either side, velocity is measured: what bends w
 _STEEPEST = 0.05  # least sine of the angle between light and surface at which a shadow's speed is computed
 
 
+_MOST_REFLECTIONS = 2  # one after another; the renderer's paths show no more of direct light
+
+
+class _Sight(NamedTuple):
+    """Rays through pixel centres, or their reflections, and the static surface points that they meet."""
+
+    pixels: np.ndarray  # [K] flat, ascending
+    origins: np.ndarray  # [K, 3]
+    ways: np.ndarray  # [K, 3] unit
+    rays: Any
+    reach: np.ndarray  # [K] distance to the static surface; inf: none
+    normals: np.ndarray  # [K, 3] of it
+    planes: tuple[np.ndarray, ...] = ()  # [K, 4] each: of the mirrors and panes that reflected a ray
+    in_glass: bool = False  # one of them is glass
+
+
 class _Shadow(NamedTuple):
     """Rays from static surface points to one point of the main light that no static surface blocks."""
 
     pixels: np.ndarray  # [K] flat
     points: np.ndarray  # [K, 3]
+    normals: np.ndarray  # [K, 3]
     ways: np.ndarray  # [K, 3] unit, towards the light
     reach: np.ndarray  # [K] distance to the light
     rays: Any
+    planes: tuple[np.ndarray, ...]  # as of a `_Sight`
 
 
 class _Snapshot(NamedTuple):
@@ -40,6 +59,7 @@ class _Snapshot(NamedTuple):
     seen: np.ndarray  # [N] bool: a moving object is visible at the pixel's centre
     hits: Hits  # of all N centre rays with moving objects, hidden or not
     shadows: list[tuple[_Shadow, np.ndarray, Hits]]  # source, which of its rays [K] bool, their hits
+    reflections: list[tuple[_Sight, np.ndarray, Hits]]  # of moving objects: sight, which of its rays [K] bool, hits
 
 
 class Visibility:
@@ -56,6 +76,14 @@ class Visibility:
     def object_masks(self, t_s: float) -> np.ndarray:
         """Return bool: the ray through the pixel's centre meets a moving object first."""
         return self._snapshot(t_s).seen.reshape(self.shape)
+
+    def moving_masks(self, t_s: float) -> np.ndarray:
+        """Return bool: the same, or a mirror shows a moving object where the ray through the pixel's centre meets it."""
+        mask = self.object_masks(t_s).copy()
+        for sight, flagged, _ in self._snapshot(t_s).reflections:
+            if not sight.in_glass:
+                mask.ravel()[sight.pixels[flagged]] = True
+        return mask
 
     def depths(self, t_s: float) -> np.ndarray:
         """Return float32: z in camera coordinates where the ray through the pixel's centre ends (inf: no surface)."""
@@ -75,23 +103,36 @@ class Visibility:
         return out.reshape(*self.shape, 3)
 
     def traced(self, t_s: float) -> np.ndarray:
-        """Return bool: within 3 px of a pixel that sees a moving object or lies in the main light's shadow of one."""
+        """Return bool: within 3 px of a pixel that sees a moving object or lies in the main light's shadow of one.
+
+        It may see either of them in a mirror or a pane.
+        """
         snapshot = self._snapshot(t_s)
         region = snapshot.seen.copy()
-        for shadow, flagged, _ in snapshot.shadows:
-            region[shadow.pixels[flagged]] = True
+        for rays, flagged, _ in (*snapshot.shadows, *snapshot.reflections):
+            region[rays.pixels[flagged]] = True
         return np.asarray(maximum_filter(region.reshape(self.shape), size=(1, 2 * GROW_PX + 1, 2 * GROW_PX + 1)))
 
     def speeds(self, t_s: float) -> np.ndarray:
-        """Return float32, px/s: the speed of the fastest moving point or shadow within 3 px, exact from geometry."""
+        """Return float32, px/s: the speed of the fastest moving point or shadow within 3 px, exact from geometry.
+
+        Those in mirrors and panes move as their mirror images do.
+        """
         snapshot = self._snapshot(t_s)
         speed = np.zeros(snapshot.seen.shape)
         seen = np.flatnonzero(snapshot.seen)
         speed[seen] = self._image_motion(seen, self._moved(seen, snapshot, t_s, t_s + _STEP_S))
         for shadow, flagged, hits in snapshot.shadows:
             pixels = shadow.pixels[flagged]
-            motion = self._image_motion(pixels, self._moved_shadow(shadow, flagged, hits, t_s))
+            moved = imaged(self._moved_shadow(shadow, flagged, hits, t_s), [p[flagged] for p in shadow.planes])
+            motion = self._image_motion(pixels, moved)
             speed[pixels] = np.maximum(speed[pixels], np.where(snapshot.seen[pixels], 0, motion))
+        for sight, flagged, hits in snapshot.reflections:
+            met = sight.origins[flagged] + sight.ways[flagged] * hits.distance[:, None]
+            moved = carried(self.world, hits, met, t_s, t_s + _STEP_S)
+            moved = imaged(moved, [p[flagged] for p in sight.planes])
+            pixels = sight.pixels[flagged]
+            speed[pixels] = np.maximum(speed[pixels], self._image_motion(pixels, moved))
         grown = maximum_filter(speed.reshape(self.shape), size=(1, 2 * GROW_PX + 1, 2 * GROW_PX + 1))
         return np.asarray(grown / _STEP_S, dtype=np.float32)
 
@@ -123,13 +164,15 @@ class Visibility:
         if self._last is None or self._last[0] != t_s:
             self._scene.set_time(t_s)
             hits = self._tracer.cast_movers(self._rays[2])
-            shadows = []
-            for shadow in self._shadows:
-                blocked = self._tracer.cast_movers(shadow.rays)
-                flagged = blocked.distance < shadow.reach
-                shadows.append((shadow, flagged, Hits(*(a[flagged] for a in blocked))))
-            self._last = (t_s, _Snapshot(hits.distance < self._static_hits[0], hits, shadows))
+            shadows, reflections = ([self._met(x) for x in some] for some in (self._shadows, self._reflections))
+            self._last = (t_s, _Snapshot(hits.distance < self._static_hits[0], hits, shadows, reflections))
         return self._last[1]
+
+    def _met(self, lines: Any) -> tuple[Any, np.ndarray, Hits]:
+        """Return a shadow or a sight, which of its rays [K] moving objects cross within their reach, and these hits."""
+        hits = self._tracer.cast_movers(lines.rays)
+        flagged = hits.distance < lines.reach
+        return lines, flagged, Hits(*(a[flagged] for a in hits))
 
     @cached_property
     def _rays(self) -> tuple[np.ndarray, np.ndarray, Any]:
@@ -147,12 +190,47 @@ class Visibility:
         """Return distance [N] and normal [N, 3] of the static surfaces."""
         return self._tracer.cast_static(self._rays[2])  # type: ignore[no-any-return]
 
+    @property
+    def _direct(self) -> _Sight:
+        return _Sight(np.arange(len(self._rays[0])), *self._rays, *self._static_hits)
+
+    @cached_property
+    def _reflections(self) -> list[_Sight]:
+        """Reflections of the centre rays; a moving object may hide the mirror."""
+        found, last = [], [self._direct]
+        for _ in range(_MOST_REFLECTIONS):
+            last = [reflected for sight in last for reflected in self._reflected(sight)]
+            found += last
+        return found
+
+    def _reflected(self, sight: _Sight) -> list[_Sight]:
+        """Return what mirrors and panes reflect of rays."""
+        found = []
+        for number, scene in enumerate(self._scene.reflectors):
+            if scene is None:
+                continue
+            distance, normals = (a.astype(np.float64) for a in self._tracer.cast_static(sight.rays, scene))
+            at = np.flatnonzero(np.isfinite(distance) & (distance <= sight.reach * (1 + 1e-5)))
+            if not len(at):  # Mitsuba casts no empty list of rays
+                continue
+            points = sight.origins[at] + sight.ways[at] * distance[at, None]
+            planes = np.concatenate([normals[at], (normals[at] * points).sum(1, keepdims=True)], axis=1)
+            ways = mirrored(sight.ways[at], planes * [1, 1, 1, 0])
+            origins = points + 1e-5 * ways  # so that they leave the mirror
+            rays = self._tracer.prepare(origins, ways)
+            passed = *(plane[at] for plane in sight.planes), planes
+            own = sight.pixels[at], origins, ways, rays, *self._tracer.cast_static(rays)
+            found.append(_Sight(*own, passed, sight.in_glass or number == 1))
+        return found
+
     @cached_property
     def _shadows(self) -> list[_Shadow]:
-        origins, directions, _ = self._rays
-        met = np.flatnonzero(np.isfinite(self._static_hits[0]))
+        return [shadow for sight in (self._direct, *self._reflections) for shadow in self._shadows_in(sight)]
+
+    def _shadows_in(self, sight: _Sight) -> list[_Shadow]:
+        met = np.flatnonzero(np.isfinite(sight.reach))
         # a little short of the surface, so that it does not shadow itself
-        points = origins[met] + directions[met] * (self._static_hits[0][met, None] * 0.9995)
+        points = sight.origins[met] + sight.ways[met] * (sight.reach[met, None] * 0.9995)
         found = []
         for source in self.world.shadow_sources:
             ways = source[:3] - source[3] * points
@@ -163,7 +241,10 @@ class Visibility:
             if not free.any():  # no light falls on what is seen, and Mitsuba casts no empty list of rays
                 continue
             rays = self._tracer.prepare(points[free], ways[free])
-            found.append(_Shadow(met[free], points[free], ways[free], reach[free], rays))
+            at = met[free]
+            planes = tuple(plane[at] for plane in sight.planes)
+            lit = sight.pixels[at], points[free], sight.normals[at].astype(np.float64)
+            found.append(_Shadow(*lit, ways[free], reach[free], rays, planes))
         return found
 
     def _moved(self, pixels: np.ndarray, snapshot: _Snapshot, from_s: float, to_s: float) -> np.ndarray:
@@ -178,8 +259,7 @@ class Visibility:
         The surface around the shadowed point is taken as plane. With S = (way to the light, w) homogeneous, the line
         from the moved blocker q along the light meets it at q - s l, where s = (q - p).n / l.n.
         """
-        p, l_before = shadow.points[flagged], shadow.ways[flagged]
-        normal = self._static_hits[1][shadow.pixels[flagged]].astype(np.float64)
+        p, l_before, normal = shadow.points[flagged], shadow.ways[flagged], shadow.normals[flagged]
         reach = shadow.reach[flagged]
         q = carried(self.world, hits, p + l_before * hits.distance[:, None], t_s, t_s + _STEP_S)
         far = np.isinf(reach)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -244,9 +245,13 @@ class WavefrontTracer:
         dr.eval(ray)
         return ray
 
-    def cast_static(self, rays: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
-        """Cast rays at static surfaces. Return distance [N] (inf: no hit) and surface normal [N, 3], float32."""
-        hit = self._scene.empty.ray_intersect(rays)
+    def cast_static(self, rays: mi.Ray3f, scene: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Cast rays at a scene: if None, at the static surfaces that are opaque.
+
+        Return distance [N] (inf: no hit) and surface normal [N, 3], float32.
+        """
+        scene = scene or self._scene.opaque
+        hit = scene.ray_intersect(rays)
         distance = dr.select(hit.is_valid(), hit.t, dr.inf)
         dr.eval(distance, hit.n)
         return np.array(distance), np.array(hit.n).T

@@ -91,6 +91,17 @@ class WorldScene:
     deforming: Mapping[str, Deforming] = field(default_factory=dict)
 
     @property
+    def mirrors(self) -> np.ndarray:
+        """The planes [P, 4] of static mirrors and panes: unit normal n, and n.p of their points p."""
+        shiny = [part.mesh for part in self.static.values() if part.material.mirror or part.material.glass]
+        corners = [mesh.vertices[mesh.faces] for mesh in shiny]
+        a, b, c = np.concatenate(corners).swapaxes(0, 1) if corners else np.zeros((3, 0, 3))
+        normals = np.cross(b - a, c - a)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        planes = np.concatenate([normals, (normals * a).sum(1, keepdims=True)], axis=1)
+        return np.unique(planes.round(9), axis=0)
+
+    @property
     def object_names(self) -> tuple[str, ...]:
         """Names of the moving objects: instances, then deforming surfaces, or the bodies of those with several."""
         names = list(self.instances)

@@ -19,16 +19,28 @@ class Material:
     Attributes:
         albedo: linear RGB in 0..1, one colour or an image [H, W, 3] whose top row is v = 0.
         gloss: None for a matte surface, else the roughness of a clear coat over the albedo (0.05 polished, 0.3 satin).
-        metal: rough metal instead, with the albedo as its mirror colour; needs `gloss`.
+        metal: rough metal instead, with the albedo as its mirror colour; needs `gloss`. With a `gloss` of 0 it is a
+            mirror; its mesh has to be static and of plane faces.
+        glass: a thin clear pane instead, without an albedo; its mesh has to be static and one plane.
     """
 
     albedo: Colour | np.ndarray
     gloss: float | None = None
     metal: bool = False
+    glass: bool = False
+
+    @property
+    def mirror(self) -> bool:
+        """Whether the surface is a mirror."""
+        return self.metal and self.gloss == 0
 
     def to_mitsuba(self) -> dict[str, Any]:
         """Return a BSDF dictionary for `mitsuba.load_dict`; the current variant must be set."""
-        if self.metal:
+        if self.glass:
+            return {"type": "thindielectric"}  # two-sided by itself
+        if self.mirror:
+            inner = {"type": "conductor", "specular_reflectance": _texture(self.albedo)}
+        elif self.metal:
             inner = {"type": "roughconductor", "alpha": self.gloss, "specular_reflectance": _texture(self.albedo)}
         elif self.gloss is not None:
             inner = {"type": "roughplastic", "alpha": self.gloss, "diffuse_reflectance": _texture(self.albedo)}

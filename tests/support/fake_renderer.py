@@ -50,7 +50,7 @@ class FakeRenderer:
         x = np.arange(self.shape[2]) - 10 - 5000 * t_s
         return np.broadcast_to((np.abs(x) < 5) & (np.abs(np.arange(self.shape[1]) - 20) < 6)[:, None], self.shape)
 
-    traced = object_masks
+    traced = moving_masks = object_masks
 
     def keys(self, t_s):
         rgb = np.where(self.object_masks(t_s)[..., None], np.float32(0.9), self.static.background)
