@@ -149,7 +149,7 @@ def make_dataset(
             if chosen.startswith("scalar"):
                 fix = "install libLLVM, see `spike4dgs doctor`, or use --device cuda"
                 raise problem("--lens, --psf-px and --rendering split", "Mitsuba's LLVM or CUDA variant", chosen, fix)
-            if job.profile.soft and len(world_of(job).mirrors):
+            if job.profile.soft and (len(world_of(job).mirrors) or world_of(job).flash):
                 expected = "a world without mirrors, glass and flashes"
                 raise problem("--rendering split", expected, job.world, "make it with --rendering paths")
             for camera in cameras_of(job):

@@ -23,8 +23,9 @@ from spike4dgs.generators.physics import from_settings, true_cameras
 from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile, SplitSampling
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
 from spike4dgs.generators.rendering.keyframes import read_arrays, write_arrays
+from spike4dgs.generators.rendering.lights.layers import Renderer, path_renderer
 from spike4dgs.generators.rendering.like_surfaces import join_soft
-from spike4dgs.generators.rendering.render import MultiViewRenderer, SoftStatic, StaticViews, anchor_s
+from spike4dgs.generators.rendering.render import SoftStatic, StaticViews, anchor_s
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS, WorldScene, build_at
 
@@ -123,7 +124,7 @@ class RenderStatic(_Task):
     soft: SoftStatic | None
 
     @cached_property
-    def _renderer(self) -> MultiViewRenderer:
+    def _renderer(self) -> Renderer:
         return renderer_of(self.job, cameras_of(self.job), truth=self.truth, soft_static=self.soft)
 
     def __call__(self, part: tuple[int, int]) -> tuple[NDArray[np.float32], ...]:
@@ -156,7 +157,7 @@ class RenderKeys(_Task):
     static: StaticViews
 
     @cached_property
-    def _renderer(self) -> MultiViewRenderer:
+    def _renderer(self) -> Renderer:
         return renderer_of(self.job, cameras_of(self.job), truth=False, static=self.static)
 
     def __call__(self, ticks: Sequence[int]) -> list[tuple[int, dict[str, NDArray[Any]]]]:
@@ -192,16 +193,15 @@ class RenderTargets(_Task):
     static: StaticViews  # with the noise of ground truth
 
     @cached_property
-    def _every_view(self) -> MultiViewRenderer:
+    def _every_view(self) -> Renderer:
         return renderer_of(self.job, cameras_of(self.job), truth=True, static=self.static)
 
     @cached_property
-    def _held_out(self) -> MultiViewRenderer:
+    def _held_out(self) -> Renderer:
         view = held_out_view(self.job)
+        static = self.static.views(range(view, len(self.static.background), len(cameras_of(self.job))))
         views = cameras_of(self.job)[view : view + 1]
-        return renderer_of(
-            self.job, views, truth=True, static=self.static.views([view]), maps_of=lambda: self._every_view
-        )
+        return renderer_of(self.job, views, truth=True, static=static, maps_of=lambda: self._every_view)
 
     def __call__(self, ticks: Sequence[int]) -> list[Truth]:
         """Return the ground truth of `ticks`."""
@@ -222,7 +222,7 @@ def renderer_of(
     truth: bool,
     seed: int | None = None,
     **others: Any,
-) -> MultiViewRenderer:
+) -> Renderer:
     """Return the renderer of streams or of ground truth, of no common random number. `others` go to the renderer."""
     p = job.profile
     own = {
@@ -234,7 +234,7 @@ def renderer_of(
         "psf_px": job.physics.psf_px,
     } | others
     if (soft := p.target_soft if truth else p.soft) is None:
-        return MultiViewRenderer(world_of(job), views, **{k: v for k, v in own.items() if k not in _OF_SPLIT})
+        return path_renderer(world_of(job), views, **{k: v for k, v in own.items() if k not in _OF_SPLIT})
     from spike4dgs.generators.rendering.split_render import SplitRenderer  # it needs compiled kernels
 
     anchors_s = anchor_s(world_of(job), cameras_of(job), soft.anchor_px)
@@ -266,7 +266,7 @@ def render_static(job: Job, folder: Path, run: Run = here, watch: Watch = unseen
 def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: Run, watch: Watch) -> StaticViews:
     """Return the static views of streams or of ground truth; paths are whole: with the background of `other`."""
     cameras, p = cameras_of(job), job.profile
-    shape = len(cameras), p.height, p.width
+    shape = len(cameras) * len(world_of(job).layers), p.height, p.width
     n = int(np.prod(shape))
     bounds = np.linspace(0, n, min(max(n // _PIXELS, 2), _MOST_PARTS) + 1).astype(int).tolist()
     ranges = list(zip(bounds[:-1], bounds[1:], strict=True))

@@ -37,6 +37,7 @@ from spike4dgs.generators.previews import contact_sheet, preview
 from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore, read_arrays, write_arrays
+from spike4dgs.generators.rendering.lights.layers import key_store
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.render import StaticViews
 from spike4dgs.generators.truth import audit, mask_file, write_truth
@@ -115,7 +116,7 @@ class Maker:
     @cached_property
     def store(self) -> KeyStore:
         """The key frames."""
-        return KeyStore(self._work / "keys")
+        return key_store(self._work / "keys", self.world)
 
     @cached_property
     def targets(self) -> tuple[Target, ...]:

@@ -126,19 +126,18 @@ def _reference(job: Job, renderer: MultiViewRenderer, spp: int) -> Callable[[flo
     """Return what renders the views of `renderer` whole at a time, with `spp` whole paths a pixel.
 
     By Mitsuba's own loop for pinholes. It knows neither our lenses nor our blur: there every pixel is traced by ours.
+    A world with a flash is loaded anew for each time, with all its lamps as bright as they are then.
     """
-    if not any(c.distortion for c in renderer.cameras) and not job.physics.psf_px:
-        return lambda t_s: renderer.reference_frames(t_s, spp)
-    whole = MultiViewRenderer(
-        world_of(job),
-        renderer.cameras,
-        seed=job.seed + _SEEDS[0],
-        spp=spp,
-        background_spp=spp,
-        psf_px=job.physics.psf_px,
-        whole_frames=True,
-    )
-    return whole.crn_frames
+    ideal = not any(c.distortion for c in renderer.cameras) and not job.physics.psf_px
+    world, own = renderer.world, {"spp": spp, "background_spp": spp, "psf_px": job.physics.psf_px}
+
+    def loaded(t_s: float) -> MultiViewRenderer:
+        seed = job.seed + _SEEDS[0]
+        return MultiViewRenderer(world.at_brightness(t_s), renderer.cameras, seed=seed, whole_frames=True, **own)
+
+    if world.flash:
+        return lambda t_s: loaded(t_s).reference_frames(t_s, spp) if ideal else loaded(t_s).crn_frames(t_s)
+    return (lambda t_s: renderer.reference_frames(t_s, spp)) if ideal else loaded(0.0).crn_frames
 
 
 def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, dict[str, float | None]]:

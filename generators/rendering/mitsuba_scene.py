@@ -55,8 +55,8 @@ class MitsubaScene:
     def __init__(self, world: WorldScene) -> None:
         mi = load_mitsuba()
         self._world = world
-        static = {name: _emitter(spec) for name, spec in world.emitters.items()}
-        static |= _shapes("static", _in_palettes(world.static))
+        lamps = {name: _emitter(spec) for name, spec in world.emitters.items()}
+        static = lamps | _shapes("static", _in_palettes(world.static))
         self._batches = _batches(world)
         moving, plain = (
             _shapes("moving", {k: b.part(dress) for k, b in self._batches.items()}) for dress in (True, False)
@@ -71,7 +71,7 @@ class MitsubaScene:
             mi.load_dict({"type": "scene", **_shapes("plain", some)}) if some else None for some in (mirrors, panes)
         ]
         solid = {k: part for k, part in world.static.items() if k not in panes}
-        self.opaque = mi.load_dict({"type": "scene", **_shapes("solid", solid)}) if panes else self.empty
+        self.opaque = mi.load_dict({"type": "scene", **lamps, **_shapes("solid", solid)}) if panes else self.empty
         self._parameters = [mi.traverse(scene) for scene in (self.full, self.movers)]
         # the scalar variants compute their own normals whenever positions are set, so ours have to come after that
         self._own_normals = str(mi.variant()).startswith("scalar")

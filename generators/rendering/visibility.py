@@ -78,7 +78,7 @@ class Visibility:
         return self._snapshot(t_s).seen.reshape(self.shape)
 
     def moving_masks(self, t_s: float) -> np.ndarray:
-        """Return bool: the same, or a mirror shows a moving object where the ray through the pixel's centre meets it."""
+        """Return bool: the same, or the ray through the pixel's centre meets a mirror that shows a moving object."""
         mask = self.object_masks(t_s).copy()
         for sight, flagged, _ in self._snapshot(t_s).reflections:
             if not sight.in_glass:

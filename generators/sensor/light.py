@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -62,10 +62,21 @@ class Flicker:
         return (1 - self.depth) / mean, (1 + self.depth) / mean
 
 
+STEADY = Flicker(depth=0.0, per_tick=1.0, phase=0.0)
+
+
+class Light(Protocol):
+    """A factor of the light: at the start of a tick, and its mean over a tick."""
+
+    def at(self, tick: float) -> float: ...  # noqa: D102
+
+    def mean(self, tick: int) -> float: ...  # noqa: D102
+
+
 class FlickeringInstants(Sequence[Float32]):
     """The radiance at the start of every tick, in flickering light; `at` returns that in steady light at a tick."""
 
-    def __init__(self, at: Callable[[int], Float32], n_ticks: int, light: Flicker) -> None:
+    def __init__(self, at: Callable[[int], Float32], n_ticks: int, light: Light) -> None:
         self._at, self._n, self._light = at, n_ticks, light
 
     def __len__(self) -> int:
@@ -84,7 +95,7 @@ class FlickeringMeans(Sequence[Float32]):
     """
 
     def __init__(
-        self, at: Callable[[int], Float32], n_ticks: int, light: Flicker, means: Sequence[Float32] | None = None
+        self, at: Callable[[int], Float32], n_ticks: int, light: Light, means: Sequence[Float32] | None = None
     ) -> None:
         self._at, self._n, self._light, self._means = at, n_ticks, light, means
 

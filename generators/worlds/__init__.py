@@ -13,7 +13,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.plugins import find_plugins
 from spike4dgs.generators.worlds import bicycle, bird, bricks, car, chips, jaywalk, motor, turntable, van
 from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene, build_at
-from spike4dgs.generators.worlds.hard import appear, beads, blank, mirror
+from spike4dgs.generators.worlds.hard import appear, beads, blank, flash, mirror
 
 __all__ = ["HARD", "OURS", "WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene", "build_at"]
 
@@ -34,7 +34,9 @@ OURS: dict[str, World] = {
     )
 }
 
-HARD: dict[str, World] = {world.name: world for world in (appear.WORLD, beads.WORLD, blank.WORLD, mirror.WORLD)}
+HARD: dict[str, World] = {
+    world.name: world for world in (appear.WORLD, beads.WORLD, blank.WORLD, flash.WORLD, mirror.WORLD)
+}
 
 
 class Worlds(Mapping[str, World]):

@@ -53,6 +53,21 @@ class RigSpec:
     fov_x_deg: float
 
 
+@dataclass(frozen=True)
+class Flash:
+    """Lamps whose brightness varies together, beside the steady ones of a world.
+
+    Attributes:
+        emitters: Mitsuba emitter dictionaries, at brightness 1.
+        shadow_sources: [K, 4], of these lamps; see `WorldScene`.
+        brightness: time in seconds -> factor from 0 up.
+    """
+
+    emitters: Mapping[str, dict[str, Any]]
+    shadow_sources: np.ndarray
+    brightness: Callable[[float], float]
+
+
 @dataclass(frozen=True, eq=False)
 class WorldScene:
     """One concrete world: static surfaces, moving surfaces, light and cameras. Metres, Z up, X right, Y away.
@@ -72,6 +87,7 @@ class WorldScene:
         depth_range: (near, far) metres that enclose everything the cameras see.
         notes: physical facts to record with the data (speed, size), name -> number with the unit in the name.
         deforming: moving surfaces that are not rigid, name -> surface.
+        flash: lamps whose brightness varies; None in steady light.
     """
 
     name: str
@@ -89,6 +105,29 @@ class WorldScene:
     depth_range: tuple[float, float]
     notes: Mapping[str, float]
     deforming: Mapping[str, Deforming] = field(default_factory=dict)
+    flash: Flash | None = None
+
+    @property
+    def layers(self) -> tuple[WorldScene, ...]:
+        """The world in the light of its steady lamps alone, and, if it has a flash, in that of its flash alone.
+
+        Lamps that are off stay where they are: they hide what is behind them.
+        """
+        if (flash := self.flash) is None:
+            return (self,)
+        dark = [{k: _without_light(v) for k, v in lamps.items()} for lamps in (self.emitters, flash.emitters)]
+        off = [{name: lamp for name, lamp in lamps.items() if lamp} for lamps in dark]
+        steady = replace(self, emitters={**self.emitters, **off[1]}, flash=None)
+        emitters, sources = {**flash.emitters, **off[0]}, flash.shadow_sources
+        return steady, replace(self, emitters=emitters, shadow_sources=sources, flash=None)
+
+    def at_brightness(self, t_s: float) -> WorldScene:
+        """Return the world with all its lamps as bright as they are at a time, and steady."""
+        if (flash := self.flash) is None:
+            return self
+        lamps = {name: _scaled(spec, flash.brightness(t_s)) for name, spec in flash.emitters.items()}
+        sources = np.concatenate([self.shadow_sources, flash.shadow_sources])
+        return replace(self, emitters={**self.emitters, **lamps}, shadow_sources=sources, flash=None)
 
     @property
     def mirrors(self) -> np.ndarray:
@@ -121,6 +160,18 @@ class WorldScene:
         return np.concatenate(chunks)
 
 
+def _without_light(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the surface of an emitter; nothing where it has none."""
+    return {k: v for k, v in spec.items() if k != "emitter"} if "emitter" in spec else {}
+
+
+def _scaled(spec: Mapping[str, Any], factor: float) -> dict[str, Any]:
+    """Return an emitter of other brightness: all its colours are radiances, or the like."""
+    if spec["type"] == "rgb":
+        return {**spec, "value": [factor * v for v in spec["value"]]}
+    return {k: _scaled(v, factor) if isinstance(v, Mapping) else v for k, v in spec.items()}
+
+
 @dataclass(frozen=True)
 class World:
     """A named family of scenes: `build(seed, variant, duration_s)`; variant 0 is the public benchmark's."""
@@ -131,10 +182,12 @@ class World:
 
 
 def build_at(world: World, seed: int, variant: int, duration_s: float, speed: float) -> WorldScene:
-    """Return a world with all motion `speed` times as fast. Its notes stay those of its own speed."""
+    """Return a world with all motion, and flashes, `speed` times as fast. Its notes stay those of its own speed."""
     built = world.build(seed, variant, duration_s * speed)
     if speed == 1:
         return built
+
+    flash = built.flash
 
     def faster(surface: Deforming) -> Deforming:
         return replace(surface, vertices=lambda t_s: surface.vertices(t_s * speed))
@@ -144,6 +197,7 @@ def build_at(world: World, seed: int, variant: int, duration_s: float, speed: fl
         duration_s=duration_s,
         poses=lambda t_s: built.poses(t_s * speed),
         deforming={name: faster(surface) for name, surface in built.deforming.items()},
+        flash=flash and replace(flash, brightness=lambda t_s: flash.brightness(t_s * speed)),
     )
 
 

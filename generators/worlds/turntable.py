@@ -19,8 +19,8 @@ from spike4dgs.generators.worlds.meshes import (
     rotation,
     translation,
 )
-from spike4dgs.generators.worlds.parts.desk import BLOCKS, INK, room
-from spike4dgs.generators.worlds.surfaces import Colour, Lamp, Material
+from spike4dgs.generators.worlds.parts.desk import BLOCKS, INK, block_image, room
+from spike4dgs.generators.worlds.surfaces import Lamp, Material
 from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, mix, plain
 
 DISC_RADIUS_M, DISC_TOP_M = 0.32, 0.05
@@ -100,7 +100,7 @@ def _disc_parts(setup: _Setup, rng: np.random.Generator) -> tuple[Part, ...]:
         size = (0.066, 0.058, 0.072)[k]
         block = box((size, size, size), (0, 0, DISC_TOP_M + size / 2)).moved(rotation("z", 0.4 + k))
         at = translation(0.165 * np.cos(angle), 0.165 * np.sin(angle), 0)
-        parts.append(Part(block.moved(at), Material(_block_image("XYZ"[k], colour, rng), 0.25)))
+        parts.append(Part(block.moved(at), Material(block_image("XYZ"[k], colour, rng), 0.25)))
     parts += _small_objects(rng)
     return tuple(parts)
 
@@ -154,14 +154,6 @@ def _top_image(setup: _Setup, rng: np.random.Generator) -> np.ndarray:
     hand = [polar(0.05, -0.15), polar(0.094, 0.0), polar(0.05, 0.15)]
     c.polygon(hand, (0.82, 0.62, 0.10))
     return c.image * (0.86 + 0.18 * fractal((n, n), rng, 64, 2))[..., None]
-
-
-def _block_image(letter: str, colour: Colour, rng: np.random.Generator) -> np.ndarray:
-    """Return a toy block's face: a coloured frame around a light field with a letter."""
-    c = Canvas(plain((96, 96), colour) * (0.85 + 0.25 * fractal((96, 96), rng, 24)[..., None]), 96)
-    c.rectangle(0.13, 0.13, 0.87, 0.87, (0.80, 0.76, 0.66))
-    c.text(letter, 0.5, 0.5, 0.50, tuple(0.5 * v for v in colour))
-    return c.image
 
 
 WORLD = World("turntable", "Letters and blocks on a spinning disc", build)

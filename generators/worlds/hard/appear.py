@@ -12,10 +12,10 @@ import numpy as np
 
 from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import box, ellipsoid, revolve, rotation, translation
-from spike4dgs.generators.worlds.parts.desk import BLOCKS, INK, room
+from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, room
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2
 from spike4dgs.generators.worlds.surfaces import Lamp, Material
-from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, plain, wood
+from spike4dgs.generators.worlds.textures import cloth, wood
 
 EDGE_M = 0.20  # from the middle to either board
 _LANE_Y_M = 0.12
@@ -91,15 +91,13 @@ def _screens(rng: np.random.Generator) -> dict[str, Part]:
 
 
 def _movers(run: _Run, rng: np.random.Generator) -> dict[str, tuple[Part, ...]]:
-    face = Canvas(plain((96, 96), BLOCKS[run.colour]) * (0.85 + 0.25 * fractal((96, 96), rng, 24)[..., None]), 96)
-    face.rectangle(0.13, 0.13, 0.87, 0.87, (0.80, 0.76, 0.66))
-    face.text(run.letter, 0.5, 0.5, 0.55, INK[run.colour])
+    face = block_image(run.letter, BLOCKS[run.colour], rng)
     stripes = cloth((48, 96), rng, [(0.75, 0.12, 0.08), (0.80, 0.78, 0.70), (0.10, 0.25, 0.60)], 16)
     body = revolve([(0.0, 0.0), (0.045, 0.0), (0.034, 0.055), (0.0, 0.055)], 32)
     hat = revolve([(0.0, 0.112), (0.012, 0.110), (0.026, 0.086), (0.028, 0.084), (0.0, 0.084)], 32)
     coat = cloth((32, 64), rng, [(0.10, 0.25, 0.60), (0.82, 0.62, 0.10)], 8)
     return {
-        "block": (Part(box((0.07, 0.07, 0.07)), Material(face.image, 0.25)),),
+        "block": (Part(box((0.07, 0.07, 0.07)), Material(face, 0.25)),),
         "ball": (Part(ellipsoid((0.04, 0.04, 0.04), segments=32), Material(stripes, 0.15)),),
         "jack": (
             Part(body, Material(coat)),

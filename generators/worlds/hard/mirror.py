@@ -16,10 +16,10 @@ import numpy as np
 
 from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import Mesh, box, ellipsoid, merge, quad, rotation, translation
-from spike4dgs.generators.worlds.parts.desk import BLOCKS, INK, room
+from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, room
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2
 from spike4dgs.generators.worlds.surfaces import Material
-from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, paving, plain
+from spike4dgs.generators.worlds.textures import cloth, paving
 
 _PANE = np.array([[-0.36, -0.27], [-0.17, 0.06]])  # its lower corners, x and y
 _PANE_M = 0.42  # its height
@@ -128,12 +128,10 @@ def _frame(feet: np.ndarray, low: float, high: float, thick: float) -> Mesh:
 
 
 def _movers(throw: _Throw, rng: np.random.Generator) -> dict[str, tuple[Part, ...]]:
-    face = Canvas(plain((96, 96), BLOCKS[throw.colour]) * (0.85 + 0.25 * fractal((96, 96), rng, 24)[..., None]), 96)
-    face.rectangle(0.13, 0.13, 0.87, 0.87, (0.80, 0.76, 0.66))
-    face.text(throw.letter, 0.5, 0.5, 0.55, INK[throw.colour])
+    face = block_image(throw.letter, BLOCKS[throw.colour], rng)
     stripes = cloth((48, 96), rng, [(0.75, 0.12, 0.08), (0.80, 0.78, 0.70), (0.10, 0.25, 0.60)], 16)
     return {
-        "block": (Part(box((0.09, 0.09, 0.09)), Material(face.image, 0.25)),),
+        "block": (Part(box((0.09, 0.09, 0.09)), Material(face, 0.25)),),
         "ball": (Part(ellipsoid((0.045, 0.045, 0.045), segments=32), Material(stripes, 0.15)),),
     }
 

@@ -109,6 +109,14 @@ def _desk_objects(rng: np.random.Generator) -> dict[str, Part]:
     }
 
 
+def block_image(letter: str, colour: Colour, rng: np.random.Generator) -> np.ndarray:
+    """Return a toy block's face: a coloured frame around a light field with a letter."""
+    c = Canvas(plain((96, 96), colour) * (0.85 + 0.25 * fractal((96, 96), rng, 24)[..., None]), 96)
+    c.rectangle(0.13, 0.13, 0.87, 0.87, (0.80, 0.76, 0.66))
+    c.text(letter, 0.5, 0.5, 0.50, tuple(0.5 * v for v in colour))
+    return c.image
+
+
 def _die() -> np.ndarray:
     c = Canvas(plain((48, 48), (0.80, 0.78, 0.72)), 48)
     for x, y in ((0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.25, 0.75), (0.75, 0.75)):

@@ -121,12 +121,13 @@ def test_moving_triangles_are_where_the_world_says(name):
     rig = cameras(world, WIDTH, HEIGHT, (4,))
     rng = np.random.default_rng(0)
     poses, middles, owners = world.poses(t_s), [], []
+    count = max(12, 120 // max(1, sum(len(world.groups[group]) for group in world.instances.values())))  # of a part
     for number, (instance, group) in enumerate(world.instances.items()):
         for part in world.groups[group]:
-            faces = part.mesh.faces[rng.integers(len(part.mesh.faces), size=12)]
+            faces = part.mesh.faces[rng.integers(len(part.mesh.faces), size=count)]
             local = part.mesh.vertices[faces].mean(1)
             middles.append(local @ poses[instance][:3, :3].T + poses[instance][:3, 3])
-            owners.append(np.full(12, number))
+            owners.append(np.full(count, number))
     for number, surface in enumerate(world.deforming.values(), start=len(world.instances)):
         faces = surface.part.mesh.faces[rng.integers(len(surface.part.mesh.faces), size=60)]
         middles.append(surface.vertices(t_s)[faces].mean(1))
@@ -138,7 +139,7 @@ def test_moving_triangles_are_where_the_world_says(name):
     # the triangle itself, or a surface in front of it; float32 rays may miss slivers and edges
     assert (hits.distance < expected * 1.0005).mean() > 0.97
     met = np.abs(hits.distance - expected) < 5e-4 * expected
-    assert met.sum() > 10 and (hits.number[met] == owner[met]).mean() > 0.9  # parts touch each other at joints
+    assert met.sum() > 20 and (hits.number[met] == owner[met]).mean() > 0.9  # parts touch each other at joints
     later = carried(world, hits, rig[0].center + ways, t_s, t_s + 1e-3)[met & (hits.number == owner)]
     parts = [world.moving_points(t) for t in (t_s, t_s + 1e-3)]
     nearest = cKDTree(parts[1]).query(later)[0]  # carried points are on the moved surface, between its vertices
