@@ -47,6 +47,6 @@ def second_truth(job: Job, view: int, seed: int) -> Callable[[float], NDArray[np
     if job.profile.soft is None:
         whole = renderer_of(job, camera, **alike, whole_frames=True)
         return lambda t_s: whole.crn_frames(t_s)[0]
-    every = renderer_of(job, cameras_of(job), **alike)
+    every: Any = renderer_of(job, cameras_of(job), **alike)
     one = renderer_of(job, camera, **alike, static=every.static.views([view]), maps_of=lambda: every)
     return lambda t_s: one.keys(t_s)[0]

@@ -129,7 +129,8 @@ def _reference(job: Job, renderer: MultiViewRenderer, spp: int) -> Callable[[flo
     A world with a flash is loaded anew for each time, with all its lamps as bright as they are then.
     """
     ideal = not any(c.distortion for c in renderer.cameras) and not job.physics.psf_px
-    world, own = renderer.world, {"spp": spp, "background_spp": spp, "psf_px": job.physics.psf_px}
+    world = renderer.world
+    own: dict[str, Any] = {"spp": spp, "background_spp": spp, "psf_px": job.physics.psf_px}
 
     def loaded(t_s: float) -> MultiViewRenderer:
         seed = job.seed + _SEEDS[0]

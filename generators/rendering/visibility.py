@@ -103,14 +103,13 @@ class Visibility:
         return out.reshape(*self.shape, 3)
 
     def traced(self, t_s: float) -> np.ndarray:
-        """Return bool: within 3 px of a pixel that sees a moving object or lies in the main light's shadow of one.
-
-        It may see either of them in a mirror or a pane.
-        """
+        """Return bool: within 3 px of a pixel that sees, directly or reflected, a moving object or its shadow."""
         snapshot = self._snapshot(t_s)
         region = snapshot.seen.copy()
-        for rays, flagged, _ in (*snapshot.shadows, *snapshot.reflections):
-            region[rays.pixels[flagged]] = True
+        for sight, flagged, _ in snapshot.reflections:
+            region[sight.pixels[flagged]] = True
+        for shadow, flagged, _ in snapshot.shadows:
+            region[shadow.pixels[flagged]] = True
         return np.asarray(maximum_filter(region.reshape(self.shape), size=(1, 2 * GROW_PX + 1, 2 * GROW_PX + 1)))
 
     def speeds(self, t_s: float) -> np.ndarray:
@@ -219,8 +218,9 @@ class Visibility:
             origins = points + 1e-5 * ways  # so that they leave the mirror
             rays = self._tracer.prepare(origins, ways)
             passed = *(plane[at] for plane in sight.planes), planes
-            own = sight.pixels[at], origins, ways, rays, *self._tracer.cast_static(rays)
-            found.append(_Sight(*own, passed, sight.in_glass or number == 1))
+            reach, facing = self._tracer.cast_static(rays)
+            own = sight.pixels[at], origins, ways, rays, reach, facing, passed
+            found.append(_Sight(*own, sight.in_glass or number == 1))
         return found
 
     @cached_property

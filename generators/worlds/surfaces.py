@@ -39,7 +39,7 @@ class Material:
         if self.glass:
             return {"type": "thindielectric"}  # two-sided by itself
         if self.mirror:
-            inner = {"type": "conductor", "specular_reflectance": _texture(self.albedo)}
+            inner: dict[str, Any] = {"type": "conductor", "specular_reflectance": _texture(self.albedo)}
         elif self.metal:
             inner = {"type": "roughconductor", "alpha": self.gloss, "specular_reflectance": _texture(self.albedo)}
         elif self.gloss is not None:
