@@ -49,7 +49,10 @@ def scenes_block(group: Group, records: Sequence[Record]) -> list[str]:
     lines = []
     for knowledge, rows, ranking in _blocks(group, own):
         ranked = [*ranking.rows, *(row for row in rows if not row.is_complete)]
-        texts = [[f"`{row.name}`", *(_of_scene(row, scene) for scene in group.scenes)] for row in ranked]
+        texts = [
+            [f"`{row.name}`", *(psnr_texts(row, scene, (RANKED_BY, "psnr")) for scene in group.scenes)]
+            for row in ranked
+        ]
         heads = ("row", *(scene.partition("-")[0] for scene in group.scenes))
         title = f"**{knowledge.capitalize()}**: PSNR where things move / of the whole image, dB, means over seeds."
         lines += [title, "", *markdown(heads, texts), ""]
@@ -170,10 +173,11 @@ def _time(row: MeasuredRow, name: str) -> str:
     return text if row.is_quiet or text == "-" else f"({text})"
 
 
-def _of_scene(row: MeasuredRow, scene: str) -> str:
+def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = ("psnr", RANKED_BY)) -> str:
+    """Return metrics of a scene, means over seeds; "-" where there are none."""
     cells = [r["metrics"] for (s, _), r in row.cells.items() if s == scene]
     means = []
-    for metric in (RANKED_BY, "psnr"):
+    for metric in metrics:
         known = [m[metric] for m in cells if metric in m]
         means.append(_text(sum(known) / len(known) if known else None, 2))
     return " / ".join(means) if cells else "-"

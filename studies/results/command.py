@@ -19,7 +19,7 @@ from spike4dgs.studies.results.plan import ABLATIONS, PLAN, TRIAL, Cell, cells_o
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.sweep import SweepSettings, sweep
 
-_GROUPS = (*PLAN, *ABLATIONS, conditions.GROUP, conditions.REFINED)
+_GROUPS = (*PLAN, *ABLATIONS, conditions.GROUP, conditions.REFINED, conditions.CONTENT)
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Choice:
 
     Args:
         only: Groups of the plan: table1 to table4, table7, unposed (table 1, poses estimated), views-3 to views-8
-            (table 5), conditions, conditions-refined, or trial (two tiny scenes). All but trial if left out.
+            (table 5), conditions, conditions-refined, content, or trial (two tiny scenes). All but trial if left out.
         rows: Rows by name; all of the groups if left out.
         scenes_of: Folder of the scenes. Those of the plan that are not there are left out.
         out: Folder for predictions and checkpoints.

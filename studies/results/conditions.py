@@ -1,4 +1,4 @@
-"""What each condition of camera and light costs a row: the same two worlds with and without it.
+"""What each condition of camera and light costs a row: the same two worlds with and without it. And hard content.
 
 Its cells are a group of the sweep's plan. No row was tuned on these variants, which move as fast as the public ones.
 """
@@ -14,8 +14,10 @@ import tyro
 
 from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.generators.physics import PhysicsOptions
+from spike4dgs.generators.worlds import HARD
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, of_group, provenance
+from spike4dgs.studies.results.blocks import NOTHING, of_group, provenance, psnr_texts
+from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
 
@@ -74,6 +76,7 @@ REFINED = Group(
     tuple(scene for condition in CONDITIONS if condition.refined for scene in condition.scenes),
     tuple(replace(row, name=f"{row.name}{SUFFIX}") for row in GROUP.rows),
 )
+CONTENT = Group("content", "Hard content", tuple(f"{world}-1-small" for world in HARD), GROUP.rows)
 
 
 def conditions_block(records: Sequence[Record]) -> list[str]:
@@ -101,6 +104,17 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         "others its change."
     )
     return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP, REFINED)]
+
+
+def content_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of the scenes with hard content: PSNR of the whole image and where things move, by row."""
+    own = of_group(CONTENT, records)
+    rows = [row for row in rows_of([row.name for row in CONTENT.rows], CONTENT.scenes, own) if row.cells]
+    if not rows:
+        return [NOTHING]
+    lines = [[f"`{row.name}`", *(psnr_texts(row, scene) for scene in CONTENT.scenes)] for row in rows]
+    legend = "PSNR of the whole image / where things move, dB."
+    return [*markdown(("row", *HARD), lines), "", legend, "", provenance(own, CONTENT)]
 
 
 Means = tuple[float, float] | None

@@ -18,7 +18,7 @@ from spike4dgs.studies.results.blocks import (
     table_block,
 )
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
-from spike4dgs.studies.results.conditions import CONDITIONS, REFINED, WORLDS, conditions_block
+from spike4dgs.studies.results.conditions import CONDITIONS, CONTENT, REFINED, WORLDS, conditions_block, content_block
 from spike4dgs.studies.results.conditions import GROUP as ON_CONDITIONS
 from spike4dgs.studies.results.pages import BLOCKS
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row
@@ -194,7 +194,9 @@ def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None
 @pytest.mark.parametrize("name", BLOCKS)
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
     assert BLOCKS[name]([]) == [NOTHING]
-    scenes = {"conditions": ON_CONDITIONS, "table2": TABLE2}.get(name.removesuffix("-scenes"), NINE).scenes
+    scenes = {"conditions": ON_CONDITIONS, "content": CONTENT, "table2": TABLE2}.get(
+        name.removesuffix("-scenes"), NINE
+    ).scenes
     rows = SHOWN.get(name, ("spike4dgs-x", "tfp+rig-flat+stg"))
     split = {"split": "views-3"} if name == "table5" else {}
     text = "\n".join(BLOCKS[name]([record(row, s, 30 + k, **split) for row in rows for k, s in enumerate(scenes)]))
@@ -263,3 +265,14 @@ def test_a_condition_with_refined_held_out_poses_has_the_scores_of_the_refined_r
     found += [record(f"{OURS}.refined", s, 29.75) for s in poses.scenes]
     lines = conditions_block(found)
     assert [line.split(" | ")[2] for line in lines[3:5]] == ["-1.50 / -1.50 |", "-0.25 / -0.25 |"]
+
+
+def test_hard_content_has_a_column_for_each_world():
+    found = [
+        record(OURS, "mirror-1-small", 30.0),
+        record(OURS, "flash-1-small", 25.0),
+        record("c", "flash-1-small", 1.0),
+    ]
+    lines = content_block(found)
+    assert lines[0] == "| row | appear | beads | blank | flash | mirror |"
+    assert lines[2:4] == [f"| `{OURS}` | - | - | - | 27.00 / 25.00 | 32.00 / 30.00 |", ""]
