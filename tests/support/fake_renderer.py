@@ -26,7 +26,7 @@ def render_fakes(monkeypatch):
     """Let `make-dataset` render scenes of the profile tiny with the FakeRenderer; the rest of it is real."""
     monkeypatch.setattr(render_tasks, "world_of", lambda job: car())
     monkeypatch.setattr(render_tasks, "plan_of", lambda job: PLAN)
-    monkeypatch.setattr(render_tasks, "MultiViewRenderer", FakeRenderer)
+    monkeypatch.setattr(render_tasks, "path_renderer", FakeRenderer)
     monkeypatch.setattr(scene_maker, "load_mitsuba", lambda: SimpleNamespace(variant=lambda: "fake"))
 
 
