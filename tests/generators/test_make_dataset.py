@@ -41,7 +41,8 @@ def plain(stage, steps, total):
     yield from steps
 
 
-def test_a_scene_is_whole_and_true(fake, tmp_path):
+def test_a_scene_is_whole_and_true(monkeypatch, tmp_path):
+    render_fakes(monkeypatch, sheets=True)
     folder = Maker(JOB, tmp_path, plain).make()
     scene = open_scene(folder)
     assert scene.id == "car-0-tiny"

@@ -22,12 +22,17 @@ def car():
     return WORLDS["car"].build(0, 0, PROFILES["tiny"].seconds)
 
 
-def render_fakes(monkeypatch):
-    """Let `make-dataset` render scenes of the profile tiny with the FakeRenderer; the rest of it is real."""
+def render_fakes(monkeypatch, sheets=False):
+    """Let `make-dataset` render scenes of the profile tiny with the FakeRenderer; the rest of it is real.
+
+    Without `sheets` a scene's sheet, which takes most of its time, is a file of some bytes.
+    """
     monkeypatch.setattr(render_tasks, "world_of", lambda job: car())
     monkeypatch.setattr(render_tasks, "plan_of", lambda job: PLAN)
     monkeypatch.setattr(render_tasks, "path_renderer", FakeRenderer)
     monkeypatch.setattr(scene_maker, "load_mitsuba", lambda: SimpleNamespace(variant=lambda: "fake"))
+    if not sheets:
+        monkeypatch.setattr(scene_maker, "contact_sheet", lambda scene, path: path.write_bytes(b"no sheet"))
 
 
 class FakeRenderer:

@@ -1,4 +1,4 @@
-"""Submitters that are killed: `python submitters.py LEADERBOARD RESULTS SUBMITTERS KILLS` reports what is left.
+"""Submitters that are killed: `python submitters.py FOLDER RECORD SUBMITTERS KILLS` reports what is left.
 
 Each submitter is a process that submits one claimed record, and is started again whenever it was killed. Kills are
 SIGKILLs at random times after a submitter began to submit.
@@ -98,6 +98,6 @@ if __name__ == "__main__":
     found, exit_codes = submit_under_fire(root / "board", everyone, kills)
     (root / "copy").mkdir()
     print(
-        f"{count} submitters, {found} kills, {time.monotonic() - began:.0f} s: exit codes {sorted(set(exit_codes))}, "
+        f"{count} submitters, {found} kills, {time.monotonic() - began:.0f} s: exit codes {exit_codes}, "
         f"lost {lost(root / 'board', everyone)}, same boards {same_boards(root / 'board', root / 'copy')}"
     )
