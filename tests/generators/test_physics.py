@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +30,14 @@ def job(**physics):
 
 def plain(stage, steps, total):
     yield from steps
+
+
+@pytest.fixture(scope="module")
+def ideal(tmp_path_factory) -> Path:
+    """The scene with every deviation off; no test may change it."""
+    with pytest.MonkeyPatch.context() as patch:
+        render_fakes(patch)
+        return Maker(JOB, tmp_path_factory.mktemp("ideal"), plain).make()
 
 
 def test_what_is_off_is_neither_in_the_id_nor_in_the_settings():
@@ -142,9 +151,9 @@ def test_dark_current_doubles_every_8_kelvin_between_silicons_two_laws():
     assert Physics(warming_k=8.0).dark_factor == 2 and Physics(warming_k=-16.0).dark_factor == 0.25
 
 
-def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibration(tmp_path, monkeypatch):
+def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibration(ideal, tmp_path, monkeypatch):
     render_fakes(monkeypatch)
-    folders = [Maker(job(warming_k=k), tmp_path / str(k), plain).make() for k in (0.0, 8.0)]
+    folders = [ideal, Maker(job(warming_k=8.0), tmp_path, plain).make()]
     for name in ("calibration/dark/cam_00.dat", "calibration/flat/cam_00.dat"):
         assert len({(f / name).read_bytes() for f in folders}) == 1
     counts = [open_stream(f / "spikes/cam_00.dat", 64, 40, 2e4, rows_bottom_up=True).counts(0, 80) for f in folders]
@@ -152,9 +161,9 @@ def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibrat
     assert added == pytest.approx(sensor_of(JOB, cameras_of(JOB)[0]).dark.mean(), rel=0.1)
 
 
-def test_a_stopped_down_lens_scales_light_and_neither_the_dark_rate_nor_the_truth(tmp_path, monkeypatch):
+def test_a_stopped_down_lens_scales_light_and_neither_the_dark_rate_nor_the_truth(ideal, tmp_path, monkeypatch):
     render_fakes(monkeypatch)
-    full, dim = (open_scene(Maker(job(light=x), tmp_path / str(x), plain).make()) for x in (1.0, 0.25))
+    full, dim = (open_scene(folder) for folder in (ideal, Maker(job(light=0.25), tmp_path, plain).make()))
     assert dim.radiance_gain == full.radiance_gain / 4
     for name in (f"images/{full.targets[0].name}.exr", "calibration/dark/cam_00.dat"):
         assert (full.root / name).read_bytes() == (dim.root / name).read_bytes()
@@ -175,12 +184,12 @@ def test_twice_the_speed_is_the_same_motion_in_half_the_time(name):
     assert fast.duration_s == job.seconds and fast.object_names == slow.object_names
 
 
-def test_lost_ticks_are_zeros_that_the_scene_lists(tmp_path, monkeypatch):
+def test_lost_ticks_are_zeros_that_the_scene_lists(ideal, tmp_path, monkeypatch):
     render_fakes(monkeypatch)
-    whole, holed = (Maker(job(lost_ticks=x), tmp_path / str(x), plain).make() for x in (0.0, 0.2))
+    holed = Maker(job(lost_ticks=0.2), tmp_path, plain).make()
     with pytest.raises(UserError, match="--allow-gaps"):
         open_scene(holed)
-    whole, holed = open_scene(whole), open_scene(holed, allow_gaps=True)
+    whole, holed = open_scene(ideal), open_scene(holed, allow_gaps=True)
     lost = []
     for camera in whole.cameras:
         there = present([g for g in holed.gaps if g.camera == camera], 80)
@@ -190,12 +199,11 @@ def test_lost_ticks_are_zeros_that_the_scene_lists(tmp_path, monkeypatch):
     assert np.mean(lost) == pytest.approx(0.2, abs=0.08) and not np.array_equal(lost[0], lost[1])
 
 
-def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(tmp_path, monkeypatch):
+def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(ideal, tmp_path, monkeypatch):
     render_fakes(monkeypatch)
-    steady, lit = (
-        open_scene(Maker(job(**p), tmp_path, plain).make()) for p in ({}, {"flicker": 0.5, "flicker_hz": 250})
-    )
-    light = job(flicker=0.5, flicker_hz=250).flicker
+    made = job(flicker=0.5, flicker_hz=250)
+    steady, lit = (open_scene(folder) for folder in (ideal, Maker(made, tmp_path, plain).make()))
+    light = made.flicker
     for target in steady.targets:
         ratio = lit.ground_truth(target) / steady.ground_truth(target)
         assert ratio == pytest.approx(light.at(target.tick), rel=2e-3)
@@ -206,7 +214,7 @@ def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(tmp_path, mon
     assert (counts[1] - dark) / (counts[0] - dark) == pytest.approx(expected, rel=0.01)
 
 
-def test_a_scenes_description_states_what_the_sensor_does(tmp_path, monkeypatch):
+def test_a_scenes_description_states_what_the_sensor_does(ideal, tmp_path, monkeypatch):
     render_fakes(monkeypatch)
     made = job(dead_ticks=1, read_noise=0.006, reset_noise=0.0009, clock_ripple=0.008)
     scene = open_scene(Maker(made, tmp_path, plain).make())
@@ -215,12 +223,12 @@ def test_a_scenes_description_states_what_the_sensor_does(tmp_path, monkeypatch)
     assert sensor["clock_ripple"] == sensor_of(made, cameras_of(made)[0]).clock_ripple == 0.008
     known = [*training.streams, *(x for r in training.recordings for x in (r.flat, r.dark))]
     assert {x.dead_ticks for x in known} == {1.0}, "methods know the law"
-    assert not {"dead_ticks", "psf_px"} & set(open_scene(Maker(JOB, tmp_path, plain).make()).meta["sensor"])
+    assert not {"dead_ticks", "psf_px"} & set(open_scene(ideal).meta["sensor"])
 
 
-def test_noise_of_other_sensors_changes_nothing_else(tmp_path, monkeypatch):
+def test_noise_of_other_sensors_changes_nothing_else(ideal, tmp_path, monkeypatch):
     render_fakes(monkeypatch)
-    quiet, noisy = (open_scene(Maker(made, tmp_path, plain).make()) for made in (JOB, job(noisy_others=True)))
+    quiet, noisy = (open_scene(folder) for folder in (ideal, Maker(job(noisy_others=True), tmp_path, plain).make()))
     assert noisy.id == "car-0-tiny-others" and noisy.revision == quiet.revision
     assert noisy.meta["source"]["physics"] == {"noisy_others": True}
     assert noisy.meta["conventional"]["noise"] == {"full_well": 10_700.0, "read": 2.9}
