@@ -13,7 +13,8 @@ places P and Q. A lost spike lies in a lost tick. So m lost spikes misfit by
     (t - e)^2                each of them, by the distance of its lost tick t from its even place e between P and Q,
 
 each divided by its variance, which the difference of the two sides' intervals says. The m of the least misfit is
-filled. That is done twice: the second time with what was filled beyond.
+filled. That is done twice: the second time with what was filled beyond. Then a few lost ticks hold what `likely_spikes`
+finds, and where that is certain they are as good as recorded.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from spike4dgs.benchmark.arrays import Int64, Mask, UInt8
 from spike4dgs.benchmark.spikes.bits import find_spike, in_threads, kernel
 from spike4dgs.benchmark.spikes.counted_recording import CountedRecording, Recording
 from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.likely_spikes import MOST, likely_spikes
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 LONGEST_TICKS = 10  # of a gap whose ticks count as measured once it is filled: a quarter of the windows of 40 ticks
@@ -45,7 +47,7 @@ AnyRecording = TypeVar("AnyRecording", SpikeStream, CountedRecording, Recording)
 
 
 def fill_gaps(stream: SpikeStream) -> SpikeStream:
-    """Return the stream with its missing ticks filled, and listed in `filled`.
+    """Return the stream with its missing ticks filled, and listed in `filled`; `certain` tells where that is certain.
 
     Gaps longer than LONGEST_TICKS remain listed in `gaps` too. Of a mapped file the pages that change are in memory,
     and no others.
@@ -59,11 +61,20 @@ def fill_gaps(stream: SpikeStream) -> SpikeStream:
     packed[~there] = 0
     plain = packed.view(np.ndarray)
     lost = np.flatnonzero(~there)
-    in_threads(_fill, packed.shape[1], plain, starts, stops, lost, pixels, small=pixels * len(starts) < _SMALL)
+    certain = np.zeros((len(lost), packed.shape[1]), np.uint8)
+    in_threads(_fill, packed.shape[1], plain, starts, stops, lost, pixels, certain, small=pixels * len(starts) < _SMALL)
     long = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > LONGEST_TICKS]
     gaps = tuple(g for g in stream.gaps if any(a <= g.first_tick < b for a, b in long))
     filled = tuple(sorted({*stream.filled, *stream.gaps}))
-    return replace(stream, packed=packed, gaps=gaps, filled=filled)
+    if stream.filled:  # gaps that were filled before
+        ticks = np.flatnonzero(~present(filled, stream.n_ticks))
+        merged = np.zeros((len(ticks), packed.shape[1]), np.uint8)
+        if stream.certain is not None:
+            earlier = np.flatnonzero(~present(stream.filled, stream.n_ticks))
+            merged[np.searchsorted(ticks, earlier)] = stream.certain
+        merged[np.searchsorted(ticks, lost)] = certain
+        certain = merged
+    return replace(stream, packed=packed, gaps=gaps, filled=filled, certain=certain)
 
 
 def _private(packed: UInt8) -> UInt8:
@@ -75,7 +86,9 @@ def _private(packed: UInt8) -> UInt8:
 
 
 @kernel
-def _fill(packed: UInt8, starts: Int64, stops: Int64, lost: Int64, pixels: int, start: int, stop: int) -> None:
+def _fill(
+    packed: UInt8, starts: Int64, stops: Int64, lost: Int64, pixels: int, certain: UInt8, start: int, stop: int
+) -> None:
     for pixel in range(8 * start, min(8 * stop, pixels)):
         for known in range(2):  # what lost ticks beyond hold
             first, n = 0, 0
@@ -93,6 +106,8 @@ def _fill(packed: UInt8, starts: Int64, stops: Int64, lost: Int64, pixels: int, 
                 limit = len(packed) if known or last + 1 == len(starts) else starts[last + 1]
                 if before >= 0 and after >= 0:
                     _fill_between(packed, pixel, before, after, lost[n:ticks], limit)
+                    if known and ticks - n <= MOST:
+                        _fill_likely(packed, pixel, before, after, lost[n:ticks], certain[n:ticks])
                 elif before >= 0:
                     for g in range(first, last + 1):
                         _go_on(packed, pixel, starts[g], stops[g], 1, limit)
@@ -111,6 +126,20 @@ def _clear(packed: UInt8, pixel: int, start: int, stop: int) -> None:
 @kernel
 def _set(packed: UInt8, pixel: int, tick: int) -> None:
     packed[tick, pixel >> 3] |= np.uint8(1 << (pixel & 7))
+
+
+@kernel
+def _fill_likely(packed: UInt8, pixel: int, before: int, after: int, lost: Int64, certain: UInt8) -> None:
+    """Fill a few lost ticks between two recorded spikes with what is likely, and set where that is certain."""
+    likely, sure = likely_spikes(packed, pixel, before, after, lost)
+    if likely < 0:
+        return
+    for d in range(len(lost)):
+        _clear(packed, pixel, lost[d], lost[d] + 1)
+        if likely >> d & 1:
+            _set(packed, pixel, lost[d])
+        if sure >> d & 1:
+            _set(certain, pixel, d)
 
 
 @kernel

@@ -37,7 +37,8 @@ class SpikeStream(Shown):
 
     `rows_bottom_up` is the order of rows in the file; every method returns images with row 0 at the top. `gaps` are
     the ticks of a recording that were lost: they hold zeros, which are no measurement. `filled` are lost ones that hold
-    what `repair.fill_gaps` found likely, which is none either. Pixels collect no light for `dead_ticks` after a spike.
+    what `repair.fill_gaps` found likely, which is none either but for the pixels that are set in `certain`: packed rows
+    for the filled ticks, in their order. Pixels collect no light for `dead_ticks` after a spike.
 
     >>> SpikeStream(pack(np.tile(np.eye(8), (25, 1, 1))), 8, 8, 20_000.0)
     <SpikeStream memory: 8x8 pixels, 25 ticks at 20000 Hz (1.25 ms)>
@@ -52,6 +53,7 @@ class SpikeStream(Shown):
     gaps: tuple[Gap, ...] = ()
     filled: tuple[Gap, ...] = ()
     dead_ticks: float = 0.0
+    certain: UInt8 | None = None
 
     @property
     def n_ticks(self) -> int:

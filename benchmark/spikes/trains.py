@@ -1,8 +1,8 @@
 """Spike trains: the bits of a stream, turned so that a pixel's ticks lie in words, and counted now and then.
 
 Where a pixel's spikes are, and how many of them come before a tick, is then found in a few operations, however long the
-clip is. The recorded spikes are here, and apart from them what lost ticks were filled with (`lost_spikes`). Trains take
-1.13 times the stream's bytes, whatever its spikes; a list of their ticks takes 32 bits for each.
+clip is. Certain spikes are here, and apart from them what lost ticks were filled with in doubt (`lost_spikes`). Trains
+take 1.13 times the stream's bytes, whatever its spikes; a list of their ticks takes 32 bits for each.
 
 The kernels below are for other kernels, on the stored order of pixels. Words of one tick lie next to each other: images
 look at all pixels around the same few ticks.
@@ -20,7 +20,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from spike4dgs.benchmark.arrays import Int64, Mask, UInt8, UInt32, UInt64
+from spike4dgs.benchmark.arrays import Int64, UInt8, UInt32, UInt64
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -31,18 +31,20 @@ _TYPES = np.uint64, np.uint32  # of words and counts
 
 @dataclass(frozen=True, eq=False)
 class SpikeTrains:
-    """The spikes of P pixels in W = n_ticks // 64 + 1 words, those of filled ticks left out."""
+    """The spikes of P pixels in W = n_ticks // 64 + 1 words, those left out that are in doubt."""
 
     words: UInt64  # [W, P] bit t & 63 of words[t >> 6, p]: pixel p fired in tick t
     before: UInt32  # [ceil(W / _COUNTED), P] spikes before word _COUNTED k
     lost: Int64  # [n_ticks + 1] filled ticks before each tick, and before the end
-    filled_words: UInt64  # as `words`, of the filled ticks alone, one after the other; empty where there are none
-    filled_before: UInt32  # as `before`
+    doubt_words: (
+        UInt64  # [2, ...] as `words`, of filled ticks alone, one after the other: those in doubt, and their spikes
+    )
+    doubt_before: UInt32  # [2, ...] as `before`
 
     @property
     def arrays(self) -> tuple[UInt64, UInt32, Int64, UInt64, UInt32]:
         """The fields, for kernels."""
-        return self.words, self.before, self.lost, self.filled_words, self.filled_before
+        return self.words, self.before, self.lost, self.doubt_words, self.doubt_before
 
 
 @lru_cache(maxsize=1)
@@ -50,8 +52,14 @@ def spike_trains(stream: SpikeStream) -> SpikeTrains:
     """Return the trains of a stream, cached for the last one: images are made stream by stream."""
     pixels, kept = stream.height * stream.width, present(stream.filled, stream.n_ticks)
     lost = np.concatenate([[0], np.cumsum(~kept)]).astype(np.int64)
-    filled = _turned(stream.packed[~kept], pixels) if stream.filled else (np.empty((0, 0), t) for t in _TYPES)
-    return SpikeTrains(*_turned(stream.packed, pixels, kept if stream.filled else None), lost, *filled)
+    if not stream.filled:
+        return SpikeTrains(*_turned(stream.packed, pixels), lost, *(np.empty((2, 0, 0), t) for t in _TYPES))
+    filled = stream.packed[~kept]
+    doubt = np.full_like(filled, 255) if stream.certain is None else ~stream.certain
+    apart = [_turned(packed, pixels) for packed in (doubt, filled & doubt)]
+    words, before = (np.stack(arrays) for arrays in zip(*apart, strict=True))
+    known = _turned(stream.packed, pixels, np.flatnonzero(~kept), words[0])
+    return SpikeTrains(*known, lost, words, before)
 
 
 def trains_bytes(stream: SpikeStream) -> int:
@@ -60,15 +68,14 @@ def trains_bytes(stream: SpikeStream) -> int:
     return sum(math.prod(s) * np.dtype(t).itemsize for s, t in zip(shapes, _TYPES, strict=True))
 
 
-def _turned(packed: UInt8, pixels: int, kept: Mask | None = None) -> tuple[UInt64, UInt32]:
-    """Return words and counts of packed ticks, of those that are `kept` [n_ticks] alone."""
+def _turned(
+    packed: UInt8, pixels: int, ticks: Int64 | None = None, doubt: UInt64 | None = None
+) -> tuple[UInt64, UInt32]:
+    """Return words and counts of packed ticks; of filled `ticks` without the pixels whose bit of `doubt` is set."""
     words, before = (np.empty(s, t) for s, t in zip(_shapes(len(packed), pixels), _TYPES, strict=True))
     in_threads(_turn, len(words), rows(packed), words)
-    if kept is not None:
-        bits = np.zeros(64 * len(words), bool)
-        bits[: len(kept)] = kept
-        masks = np.packbits(bits.reshape(-1, 64), axis=1, bitorder="little").view("<u8").astype(np.uint64)
-        np.bitwise_and(words, masks, out=words)
+    if doubt is not None:
+        in_threads(_leave_out, pixels, words, ticks, doubt)
     in_threads(_accumulate, pixels, words, before)
     return words, before
 
@@ -106,6 +113,15 @@ def _transposed(x: Any) -> Any:
     x = x ^ t ^ (t << np.uint64(14))
     t = (x ^ (x >> np.uint64(28))) & np.uint64(0x00000000F0F0F0F0)
     return x ^ t ^ (t << np.uint64(28))
+
+
+@kernel
+def _leave_out(words: UInt64, ticks: Int64, doubt: UInt64, start: int, stop: int) -> None:
+    """Clear the bits of pixels [start, stop) in some ticks, the k-th one's where bit k of their `doubt` is set."""
+    for k in range(len(ticks)):
+        w, bit = ticks[k] >> 6, np.uint64(ticks[k] & 63)
+        for p in range(start, stop):
+            words[w, p] &= ~((doubt[k >> 6, p] >> np.uint64(k & 63) & np.uint64(1)) << bit)
 
 
 @kernel

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.arrays import Float32, Float64, Int64, UInt8, UInt32, UInt64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
-from spike4dgs.benchmark.spikes.lost_spikes import fewest, filled_between, most
+from spike4dgs.benchmark.spikes.lost_spikes import doubtful_between, fewest, most
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains
 from spike4dgs.method.images.base import ImageMaker
@@ -105,8 +105,8 @@ def _choose(
     words: UInt64,
     before: UInt32,
     lost: Int64,
-    filled_words: UInt64,
-    filled_before: UInt32,
+    doubt_words: UInt64,
+    doubt_before: UInt32,
     light: Float64,
     tick: int,
     starts: Int64,
@@ -136,8 +136,9 @@ def _choose(
                 j, last, wider = k, last_before(words, p, stops[s]), True
             if wider and j > i:
                 length = light[last] - light[first]
-                filled = filled_between(lost, filled_words, filled_before, p, first, last)
-                doubt = lost[last] - lost[first]
+                doubt, filled = 0, 0
+                if lost[last] > lost[first]:
+                    doubt, filled = doubtful_between(lost, doubt_words, doubt_before, p, first, last)
                 low = max(low, fewest(j - i, filled, doubt) / (length + 1))
                 high = min(high, most(j - i, filled, doubt) / (length - 1) if length > 1 else np.inf)
                 if low > high:
@@ -151,8 +152,8 @@ def _estimate(
     words: UInt64,
     before: UInt32,
     lost: Int64,
-    filled_words: UInt64,
-    filled_before: UInt32,
+    doubt_words: UInt64,
+    doubt_before: UInt32,
     light: Float64,
     tick: int,
     starts: Int64,
@@ -165,7 +166,9 @@ def _estimate(
     """Set each pixel's rate over its window, or over the next longer one that has two spikes."""
     for p in range(start, stop):
         total, after = count_before(words, before, p, len(light)), count_before(words, before, p, tick)
-        filled = filled_between(lost, filled_words, filled_before, p, 0, len(light))
+        filled = 0
+        if lost[-1] > 0:
+            _, filled = doubtful_between(lost, doubt_words, doubt_before, p, 0, len(light))
         image[p] = np.float32((total + filled) / len(light))
         if total < 2:
             continue
@@ -176,7 +179,9 @@ def _estimate(
                 # The spikes next to `tick` count even where the window is too short for them.
                 first = last_before(words, p, tick) if i + 1 == after else first_from(words, p, starts[s])
                 last = first_from(words, p, tick) if j == after else last_before(words, p, stops[s])
-                filled = filled_between(lost, filled_words, filled_before, p, first, last)
+                filled = 0
+                if lost[last] > lost[first]:
+                    _, filled = doubtful_between(lost, doubt_words, doubt_before, p, first, last)
                 image[p] = np.float32((j - i + filled) / (light[last] - light[first]))
                 break
 

@@ -14,15 +14,15 @@ light changes, the shorter its span.
 A window that no change ends soon may still hide one of less than a spike: a faint texture that moves. So `adaptive`'s
 rate over the whole window is taken only where light is constant for much longer than a span.
 
-Of a recording that lacks ticks, j - i is certain only between ticks of one run, which lacks none. A span that would
-hold lost ticks is moved into a run: of those near by, the one that holds the longest part of a window of 2 h moved by
-no more than MOVED h. Where that span is less than LEAST of the other, as in the dark, the other is kept, with the rate
-k / (T - D) of `lost_spikes`: filled spikes would lie to the same side wherever light changes in the same way.
+Of a recording that lacks ticks, j - i is certain only within one run, which holds no lost tick that is in doubt for the
+pixel. A span that would hold such ticks is moved into a run: of those near by, the one that holds the longest part of a
+window of 2 h moved by no more than MOVED h. Where that span is less than LEAST of the other, as in the dark, the other
+is kept, with the rate k / (T - D) of `lost_spikes`: spikes in doubt would lie to the same side wherever light changes
+in the same way.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,7 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float32, Float64, Int64, UInt32, UInt64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
-from spike4dgs.benchmark.spikes.lost_spikes import recorded_runs
+from spike4dgs.benchmark.spikes.lost_spikes import doubtful_between, is_doubtful
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains
 from spike4dgs.method.images.adaptive import AdaptiveSettings, gathered, half_windows, rates, shared_levels
@@ -82,10 +82,9 @@ def intervals(
     rate, halves = rates(stream, tick, s, levels, light), half_spans(stream.n_ticks, s)[levels]
     spans = np.empty((2, pixels), np.float32)
     spans[0], spans[1] = -s.half, s.half
-    near = math.ceil((1 + MOVED) * s.half)
-    runs = recorded_runs(trains.lost, tick - near, tick + near)
-    arguments = (trains.words, trains.before, trains.lost, *runs, tick, halves, changing, rate, spans)
-    in_threads(_measure, pixels, *arguments)
+    in_threads(
+        _measure, pixels, *trains.arrays, np.flatnonzero(np.diff(trains.lost)), tick, halves, changing, rate, spans
+    )
     image, ends = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
     return (image[::-1], ends[:, ::-1]) if stream.rows_bottom_up else (image, ends)
 
@@ -106,11 +105,11 @@ def _nearest(words: UInt64, before: UInt32, pixel: int, total: int, instant: flo
 
 
 @kernel
-def _between_lost_ticks(
+def _between_doubts(
     words: UInt64,
     before: UInt32,
-    starts: Int64,
-    stops: Int64,
+    doubt_words: UInt64,
+    lost_ticks: Int64,
     pixel: int,
     total: int,
     tick: int,
@@ -119,26 +118,33 @@ def _between_lost_ticks(
 ) -> tuple[int, int, int, int]:
     """Return number and tick of the first and the last spike of a span within one run; twice the same: there is none.
 
-    `half` is in ticks, `total` the pixel's recorded spikes, and [starts, stops) are the runs of recorded ticks.
+    `half` is in ticks, `total` the pixel's certain spikes. Runs lie between lost ticks that are in doubt.
     """
-    longest, found = 0.0, (0, 0, 0, 0)
-    for r in range(len(starts)):
-        low = max(float(starts[r]), tick - (1 + MOVED) * half)
-        high = min(float(stops[r]), tick + (1 + MOVED) * half)
+    longest, found, reach = 0.0, (0, 0, 0, 0), (1 + MOVED) * half
+    k, start = np.searchsorted(lost_ticks, int(np.ceil(tick - reach))), 0
+    for earlier in range(k - 1, -1, -1):
+        if is_doubtful(doubt_words, pixel, earlier):
+            start = lost_ticks[earlier] + 1
+            break
+    while start < min(tick + reach, n_ticks):
+        while k < len(lost_ticks) and not is_doubtful(doubt_words, pixel, k):
+            k += 1
+        stop = lost_ticks[k] if k < len(lost_ticks) else n_ticks
+        low, high = max(float(start), tick - reach), min(float(stop), tick + reach)
         if high - low > 2 * half:
             middle = min(max(float(tick), low + half), high - half)
             low, high = middle - half, middle + half
-        begin, end = count_before(words, before, pixel, starts[r]), count_before(words, before, pixel, stops[r])
-        if high - low <= longest or end - begin < 2:
-            continue
-        i, first = _nearest(words, before, pixel, total, low, n_ticks)
-        j, last = _nearest(words, before, pixel, total, high, n_ticks)
-        if i < begin:
-            i, first = begin, first_from(words, pixel, starts[r])
-        if j >= end:
-            j, last = end - 1, last_before(words, pixel, stops[r])
-        if i < j and tick - first - 0.5 <= FOLLOWED * half and last + 0.5 - tick <= FOLLOWED * half:
-            longest, found = high - low, (i, first, j, last)
+        begin, end = count_before(words, before, pixel, start), count_before(words, before, pixel, stop)
+        if high - low > longest and end - begin >= 2:
+            i, first = _nearest(words, before, pixel, total, low, n_ticks)
+            j, last = _nearest(words, before, pixel, total, high, n_ticks)
+            if i < begin:
+                i, first = begin, first_from(words, pixel, start)
+            if j >= end:
+                j, last = end - 1, last_before(words, pixel, stop)
+            if i < j and tick - first - 0.5 <= FOLLOWED * half and last + 0.5 - tick <= FOLLOWED * half:
+                longest, found = high - low, (i, first, j, last)
+        k, start = k + 1, stop + 1
     return found
 
 
@@ -147,8 +153,9 @@ def _measure(
     words: UInt64,
     before: UInt32,
     lost: Int64,
-    starts: Int64,
-    stops: Int64,
+    doubt_words: UInt64,
+    doubt_before: UInt32,
+    lost_ticks: Int64,
     tick: int,
     halves: Float32,
     light: Float64,
@@ -173,12 +180,15 @@ def _measure(
             else:
                 j, last = j + 1, first_from(words, p, last + 1)
         length = light[last] - light[first]
+        doubt = 0
         if lost[last] > lost[first]:
-            a, begin, b, end = _between_lost_ticks(words, before, starts, stops, p, total, tick, halves[p], n)
+            doubt, _ = doubtful_between(lost, doubt_words, doubt_before, p, first, last)
+        if doubt > 0:
+            a, begin, b, end = _between_doubts(words, before, doubt_words, lost_ticks, p, total, tick, halves[p], n)
             if end > begin and end - begin >= LEAST * (last - first):
                 i, first, j, last, length = a, begin, b, end, light[end] - light[begin]
             else:
-                length *= 1 - (lost[last] - lost[first]) / (last - first)
+                length *= 1 - doubt / (last - first)
         rate[p] = np.float32((j - i) / length)
         spans[0, p], spans[1, p] = first + 0.5 - tick, last + 0.5 - tick
 

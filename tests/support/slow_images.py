@@ -1,7 +1,8 @@
 """The slow, obvious image makers: float64 or 50 digits, one pixel after the other, straight from the definitions.
 
 The fast makers are tested against these, and the report of hard cases compares them. Arguments: spikes [T, H, W] of 0
-and 1, upright and unpacked, and a tick; they return spikes per tick [H, W]. `lost` are ticks [T] that were filled.
+and 1, upright and unpacked, and a tick; they return spikes per tick [H, W]. `lost` are ticks [T] that were filled, or
+[T, H, W] those of each pixel that are in doubt.
 """
 
 from __future__ import annotations
@@ -24,10 +25,19 @@ Lost = NDArray[np.bool_] | None
 PUBLISHED = Decimal("0.15"), Decimal("0.15"), Decimal(1), Decimal(10)  # TFSTP's u0, f, D, F
 
 
-def stream_of(spikes: Spikes, bottom_up: bool = True, lost: Lost = None) -> SpikeStream:
-    """Return spikes [T, H, W] as a stream in memory."""
+def stream_of(spikes: Spikes, bottom_up: bool = True, lost: Lost = None, certain: Lost = None) -> SpikeStream:
+    """Return spikes [T, H, W] as a stream in memory; `certain` [T, H, W] says where lost ticks are."""
     filled = () if lost is None else tuple(Gap("cam_00", int(t), 1, "lost") for t in np.flatnonzero(lost))
-    return SpikeStream(pack(spikes, bottom_up), spikes.shape[2], spikes.shape[1], 20_000.0, bottom_up, filled=filled)
+    sure = None if certain is None else pack(certain[lost], bottom_up)
+    size = spikes.shape[2], spikes.shape[1], 20_000.0, bottom_up
+    return SpikeStream(pack(spikes, bottom_up), *size, filled=filled, certain=sure)
+
+
+def _of_pixels(spikes: Spikes, lost: Lost) -> NDArray[np.bool_]:
+    """Return which ticks are in doubt [T, H, W]."""
+    if lost is None or lost.ndim == 3:
+        return np.zeros(spikes.shape, bool) if lost is None else lost
+    return np.broadcast_to(lost[:, None, None], spikes.shape)
 
 
 def slow_tfp(spikes: Spikes, tick: int, half_window: int) -> Float64:
@@ -57,14 +67,14 @@ def slow_tfi(spikes: Spikes, tick: int) -> Float64:
     return image
 
 
-def _recorded(spikes: Spikes, lost: Lost) -> NDArray[np.int64]:
-    """Return the ticks of the recorded spikes of one pixel [T]."""
-    return np.flatnonzero(spikes if lost is None else (spikes != 0) & ~lost)
+def _certain(spikes: Spikes, doubt: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the ticks of the spikes of one pixel [T] that are not in doubt."""
+    return np.flatnonzero((spikes != 0) & ~doubt)
 
 
-def _window(spikes: Spikes, tick: int, half: float, lost: Lost) -> tuple[float | None, NDArray[np.int64]]:
-    """Return the rate of one pixel [T] over a window, None with fewer than two spikes, and its recorded spikes."""
-    t = _recorded(spikes, lost)
+def _window(spikes: Spikes, tick: int, half: float, doubt: NDArray[np.bool_]) -> tuple[float | None, NDArray[np.int64]]:
+    """Return the rate of one pixel [T] over a window, None with fewer than two spikes, and its certain spikes."""
+    t = _certain(spikes, doubt)
     near = (t >= tick - half) & (t < tick + half)
     near |= (t == t[t < tick].max(initial=-1)) | (t == t[t >= tick].min(initial=len(spikes)))
     t = t[near]
@@ -75,14 +85,14 @@ def slow_levels(spikes: Spikes, tick: int, settings: AdaptiveSettings, lost: Los
     """Return each pixel's longest window that a constant rate explains, [H, W]; of neighbours, the shortest."""
     n, height, width = spikes.shape
     halves, reach = half_windows(n, settings), settings.shared_px // 2
-    level = np.full((height, width), len(halves) - 1)
+    level, in_doubt = np.full((height, width), len(halves) - 1), _of_pixels(spikes, lost)
     for y, x in np.ndindex(height, width):
         known = []
         for s, half in enumerate(halves):
-            rate, t = _window(spikes[:, y, x], tick, half, lost)
+            rate, t = _window(spikes[:, y, x], tick, half, in_doubt[:, y, x])
             if rate is None:
                 continue
-            k, length, doubtful = len(t) - 1, t[-1] - t[0], 0 if lost is None else int(lost[t[0] : t[-1]].sum())
+            k, length, doubtful = len(t) - 1, t[-1] - t[0], int(in_doubt[t[0] : t[-1], y, x].sum())
             likely = int(np.count_nonzero(spikes[t[0] : t[-1], y, x]))
             fewest, most = (max(k, likely - 1), min(k + doubtful, likely + 1)) if doubtful else (k, k)
             known.append((fewest / (length + 1), most / (length - 1) if length > 1 else math.inf))
@@ -104,9 +114,9 @@ def slow_adaptive(spikes: Spikes, tick: int, settings: AdaptiveSettings | None =
 
 def _slow_rates(spikes: Spikes, tick: int, halves: Float64, level: NDArray[np.int64], lost: Lost) -> Float64:
     """Return each pixel's rate over its window, or over the next longer one that has two spikes."""
-    image = np.asarray(spikes.astype(np.float64).sum(axis=0) / len(spikes))
+    image, doubt = np.asarray(spikes.astype(np.float64).sum(axis=0) / len(spikes)), _of_pixels(spikes, lost)
     for y, x in np.ndindex(image.shape):
-        rates = [_window(spikes[:, y, x], tick, half, lost)[0] for half in halves[level[y, x] :]]
+        rates = [_window(spikes[:, y, x], tick, half, doubt[:, y, x])[0] for half in halves[level[y, x] :]]
         image[y, x] = next((r for r in rates if r is not None), image[y, x])
     return image
 
@@ -118,29 +128,32 @@ def slow_intervals(
     s = settings or IntervalSettings()
     halves, level = half_windows(len(spikes), s), slow_levels(spikes, tick, s, lost)
     image, spans = _slow_rates(spikes, tick, halves, level, lost), np.empty((2, *spikes.shape[1:]))
-    spans[0], spans[1] = -s.half, s.half
+    spans[0], spans[1], doubt = -s.half, s.half, _of_pixels(spikes, lost)
     for y, x in np.ndindex(image.shape):
         window = float(halves[level[y, x]])
         if window >= s.still or level[y, x] == len(halves) - 1:
             continue
         # Half a span is a float32 number: 4.000000000000001 would tell apart two spikes that are equally near.
         half = float(np.float32(min(s.half, max(s.shortest, window / s.growth))))
-        if found := _measured(_recorded(spikes[:, y, x], lost), tick, half, lost):
+        if found := _measured(spikes[:, y, x], tick, half, doubt[:, y, x]):
             image[y, x], spans[:, y, x] = found[0], found[1:]
     return image, spans
 
 
-def _measured(fired: NDArray[np.int64], tick: int, half: float, lost: Lost) -> tuple[float, float, float] | None:
-    """Return rate, first and last instant of a pixel's span; None with fewer than two recorded spikes, `fired`."""
+def _measured(spikes: Spikes, tick: int, half: float, doubt: NDArray[np.bool_]) -> tuple[float, float, float] | None:
+    """Return rate, first and last instant of a pixel's span; None with fewer than two certain spikes."""
+    fired = _certain(spikes, doubt)
     found = _between_spikes(fired, tick - half, tick + half, tick)
-    if found is None or lost is None or not (doubtful := lost[fired[found[0]] : fired[found[1]]].sum()):
-        length = 0 if found is None else fired[found[1]] - fired[found[0]]
-        return None if found is None else _span(fired, *found, tick, length)
-    length = fired[found[1]] - fired[found[0]]
+    if found is None:
+        return None
+    first, last = fired[list(found)]
+    length = last - first
+    if not (doubtful := doubt[first:last].sum()):
+        return _span(fired, *found, tick, length)
     windows = []
-    numbers = np.cumsum(lost)  # ticks of one run have one number
-    for number in np.unique(numbers[~lost]):
-        run = np.flatnonzero((numbers == number) & ~lost)
+    numbers = np.cumsum(doubt)  # ticks of one run have one number
+    for number in np.unique(numbers[~doubt]):
+        run = np.flatnonzero((numbers == number) & ~doubt)
         start, stop = run[0], run[-1] + 1
         low, high = max(start, tick - (1 + MOVED) * half), min(stop, tick + (1 + MOVED) * half)
         if high - low > 2 * half:

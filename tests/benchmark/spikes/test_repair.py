@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from memory import STATUS, resident_bytes
+from slow_likely import slow_likely
 
 from spike4dgs.benchmark.spikes.gaps import Gap
+from spike4dgs.benchmark.spikes.likely_spikes import MOST
 from spike4dgs.benchmark.spikes.repair import (
     EVEN,
     FAR_EVEN,
@@ -73,6 +75,8 @@ def test_a_long_gap_goes_on_at_the_rate_and_remains_listed():
         filled.filled
     )
     assert np.abs(_counts(filled) - spikes.sum(0)).max() <= 1 + 60 / NEAR_TICKS
+    assert not filled.certain[:60].any() and filled.certain[60:].any(), "what a long gap held is never certain"
+    np.testing.assert_array_equal(fill_gaps(filled).certain, filled.certain)
 
 
 @pytest.mark.parametrize("gap", [(0, 30), (370, 30), (0, 400)])
@@ -154,7 +158,8 @@ def go_on(times, start, stop):
 
 
 def twin(fired, lost):
-    """Return one pixel's spikes [T] with those of its lost ticks, in plain Python."""
+    """Return one pixel's spikes [T] with those of its lost ticks, and where these are certain, in plain Python."""
+    certain = np.zeros(len(fired), bool)
     fired, recorded = fired.copy(), [int(t) for t in np.flatnonzero(fired & ~lost)]
     runs = np.flatnonzero(np.diff(np.concatenate([[0], lost, [0]]).astype(int))).reshape(-1, 2).tolist()
     for known in (False, True):
@@ -169,13 +174,18 @@ def twin(fired, lost):
             if p is not None and q is not None:
                 ticks = [t for a, b in own for t in range(a, b)]
                 fired[between([t for t in range(high) if fired[t]][::-1], past, ticks)] = 1
+                if known and len(ticks) <= MOST:
+                    found = slow_likely([t for t in range(low + 1) if fired[t]][::-1], past, ticks)
+                    if found:
+                        fired[low + 1 : high] = 0
+                        fired[found[0]], certain[found[1]] = 1, True
             elif p is not None:
                 for a, b in own:
                     fired[go_on([t for t in range(a) if fired[t]][::-1], a, b)] = 1
             elif q is not None:
                 for a, b in own[::-1]:
                     fired[go_on([t for t in range(b, later) if fired[t]], a, b)] = 1
-    return fired
+    return fired, certain
 
 
 @settings(max_examples=40, deadline=None)
@@ -195,10 +205,12 @@ def test_the_kernel_is_its_twin_whatever_is_lost(gaps, even, seed):
     for first, ticks in gaps:
         lost[first : first + ticks] = True
     spikes[lost] = 0
-    expected = np.stack([twin(s, lost) for s in spikes.reshape(140, -1).T], axis=1).reshape(spikes.shape)
-    runs = [(int(t), 1) for t in np.flatnonzero(lost)]
-    found = fill_gaps(stream_of(spikes, runs)).window(0, 140)
-    assert (found != expected).any(axis=0).mean() <= 0.01, "what is as near may round to either side"
+    expected = np.array([twin(s, lost) for s in spikes.reshape(140, -1).T]).transpose(1, 2, 0)
+    stream = fill_gaps(stream_of(spikes, [(int(t), 1) for t in np.flatnonzero(lost)]))
+    sure = np.unpackbits(stream.certain, axis=1, count=WIDTH * HEIGHT, bitorder="little").reshape(-1, HEIGHT, WIDTH)
+    found = stream.window(0, 140).reshape(140, -1), sure[:, ::-1].reshape(len(sure), -1)
+    wrong = (found[0] != expected[0]).any(axis=0) | (found[1] != expected[1][lost]).any(axis=0)
+    assert wrong.mean() <= 0.01, "what is as near may round to either side"
 
 
 def filled_ticks(spikes, lost):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from memory import peak_bytes
 
 from spike4dgs.benchmark.spikes.gaps import Gap
-from spike4dgs.benchmark.spikes.lost_spikes import filled_between, recorded_runs
+from spike4dgs.benchmark.spikes.lost_spikes import doubtful_between, is_doubtful
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains, trains_bytes
 
@@ -42,23 +42,23 @@ def test_numbers_and_ticks_of_spikes_are_those_of_a_plain_loop(n: int, width: in
 @settings(max_examples=30, deadline=None)
 @example(64, 1.0, 0)
 @given(st.integers(1, 300), st.sampled_from([0.0, 0.05, 0.5, 1.0]), st.integers(0, 2**31))
-def test_recorded_and_filled_spikes_are_apart(n: int, share: float, seed: int) -> None:
+def test_certain_spikes_and_those_in_doubt_are_apart(n: int, share: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     spikes, lost = rng.random((n, 1, 9)) < 0.3, rng.random(n) < share
+    doubt = lost[:, None, None] & (rng.random((n, 1, 9)) < (0.5 if seed % 2 else 2))
     gaps = tuple(Gap("c", int(t), 1, "lost") for t in np.flatnonzero(lost))
-    trains = spike_trains(replace(stream_of(spikes), filled=gaps))
+    sure = pack(~doubt[lost], rows_bottom_up=False) if seed % 2 else None
+    trains = spike_trains(replace(stream_of(spikes), filled=gaps, certain=sure))
     np.testing.assert_array_equal(trains.lost, np.concatenate([[0], np.cumsum(lost)]))
     for pixel in range(9):
+        own = doubt[:, 0, pixel]
+        found = [is_doubtful(trains.doubt_words, pixel, number) for number in range(int(lost.sum()))]
+        np.testing.assert_array_equal(found, own[lost])
         for a, b in np.sort(rng.integers(0, n + 1, (8, 2)), axis=1).tolist():
-            recorded = [count_before(trains.words, trains.before, pixel, t) for t in (a, b)]
-            assert recorded[1] - recorded[0] == (spikes[a:b, 0, pixel] & ~lost[a:b]).sum()
-            filled = filled_between(trains.lost, trains.filled_words, trains.filled_before, pixel, a, b)
-            assert filled == (spikes[a:b, 0, pixel] & lost[a:b]).sum()
-    start, stop = sorted(rng.integers(-5, n + 5, 2).tolist())
-    whole = list(zip(*recorded_runs(trains.lost, start, stop), strict=True))
-    runs = [t for a, b in whole for t in range(a, b)]
-    assert [t for t in runs if start <= t < stop] == [t for t in range(max(start, 0), min(stop, n)) if not lost[t]]
-    assert all(t == 0 or t == n or lost[t - 1] != lost[t] for a, b in whole for t in (a, b)), "whole runs"
+            certain = [count_before(trains.words, trains.before, pixel, t) for t in (a, b)]
+            assert certain[1] - certain[0] == (spikes[a:b, 0, pixel] & ~own[a:b]).sum()
+            found = doubtful_between(trains.lost, trains.doubt_words, trains.doubt_before, pixel, a, b)
+            assert found == (own[a:b].sum(), (spikes[a:b, 0, pixel] & own[a:b]).sum())
 
 
 def test_padding_bits_of_the_last_byte_are_no_pixels() -> None:
