@@ -121,7 +121,7 @@ def _between_doubts(
     `half` is in ticks, `total` the pixel's certain spikes. Runs lie between lost ticks that are in doubt.
     """
     longest, found, reach = 0.0, (0, 0, 0, 0), (1 + MOVED) * half
-    k, start = np.searchsorted(lost_ticks, int(np.ceil(tick - reach))), 0
+    k, start = int(np.searchsorted(lost_ticks, int(np.ceil(tick - reach)))), 0
     for earlier in range(k - 1, -1, -1):
         if is_doubtful(doubt_words, pixel, earlier):
             start = lost_ticks[earlier] + 1
