@@ -2,17 +2,20 @@
 
 Files that numba leaves in an installed package outlive the package, and the folder that they keep alive then hides
 another install. The folder here is named by this package's version, and numba names a folder in it by the path of the
-sources: no install takes code from another.
+sources: no install takes code from another. numba compiles a kernel anew where its own file changes, but a kernel has
+the code and the constants of other files in it; so a digest of these names a folder too.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 import threading
 from collections.abc import Callable
 from functools import cache, update_wrapper
 from importlib.metadata import PackageNotFoundError, version
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from spike4dgs.benchmark.files import user_cache
@@ -64,14 +67,56 @@ def cached_jit(jit: Callable[..., Any], **options: Any) -> Callable[[Callable[..
 
     def decorate(function: Callable[..., Any]) -> Any:
         with _lock:  # the setting belongs to numba: another package must not see it
-            before, folder = config.CACHE_DIR, config.CACHE_DIR or _folder()
-            config.CACHE_DIR = folder
+            before, base = config.CACHE_DIR, config.CACHE_DIR or _folder()
+            config.CACHE_DIR = folder = os.path.join(base, parts_digest(function))
             try:
                 return jit(cache=_is_writable(folder), **options)(function)
             finally:
                 config.CACHE_DIR = before
 
     return decorate
+
+
+def parts_digest(function: Callable[..., Any]) -> str:
+    """Return a digest of a function, of the functions that it calls, and of the constants that they name.
+
+    Constants are numbers, texts, tuples and arrays in the functions' modules, in other modules of this package that
+    they name, and in closures.
+    """
+    digest, seen = hashlib.sha256(), set[FunctionType]()
+
+    def add(value: Any) -> None:
+        if isinstance(value, _Deferred):
+            value = value._function
+        value = getattr(value, "py_func", value)  # of numba's dispatchers
+        if isinstance(value, FunctionType):
+            if value not in seen:
+                seen.add(value)
+                digest.update(repr(_instructions(value.__code__)).encode())
+                for part in _parts(value):
+                    add(part)
+        elif isinstance(value, bool | int | float | str | bytes | tuple):
+            digest.update(repr(value).encode())
+        elif hasattr(value, "tobytes"):
+            digest.update(value.tobytes())
+
+    add(function)
+    return digest.hexdigest()[:12]
+
+
+def _instructions(code: CodeType) -> tuple[Any, ...]:
+    constants = [_instructions(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+    return code.co_code, code.co_names, code.co_varnames, code.co_freevars, constants
+
+
+def _parts(function: FunctionType) -> list[Any]:
+    """Return what the names of a function stand for, the functions of this package and constants among it."""
+    code, known = function.__code__, function.__globals__
+    modules = [v for n in code.co_names if isinstance(v := known.get(n), ModuleType)]
+    modules = [m for m in modules if m.__name__.partition(".")[0] == __name__.partition(".")[0]]
+    found = [known[n] for n in code.co_names if n in known]
+    found += [vars(m)[n] for m in modules for n in code.co_names if n in vars(m)]
+    return found + [cell.cell_contents for cell in function.__closure__ or ()]
 
 
 def _folder() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import subprocess
@@ -62,6 +63,44 @@ def test_numbas_variable_goes_before(install: Path, tmp_path: Path) -> None:
     unpack_in(install, XDG_CACHE_HOME=str(tmp_path / "cache"), NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
     assert compiled(tmp_path / "chosen") and not (tmp_path / "cache/spike4dgs/numba").exists()
     assert not compiled(install)
+
+
+KERNEL = """
+from spike4dgs.benchmark.compilation import cached_njit
+from parts_of_kernel import SCALE, plus
+
+@cached_njit(nogil=True)
+def kernel(x):
+    return plus(SCALE * x)
+"""
+PARTS = """
+from spike4dgs.benchmark.compilation import cached_njit
+SCALE = 2
+_ADDED = 1
+
+@cached_njit(nogil=True)
+def plus(x):
+    return x + _ADDED
+"""
+
+
+def test_a_kernel_is_compiled_anew_where_another_file_changes_what_is_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """numba itself looks at the kernel's file alone, and would go on with the machine code of the first."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "kernel_of_parts.py").write_text(KERNEL)
+    found, counts = [], []
+    for text in (PARTS, PARTS.replace("SCALE = 2", "SCALE = 7"), PARTS.replace("_ADDED = 1", "_ADDED = 30"), PARTS):
+        (tmp_path / "parts_of_kernel.py").write_text(text)
+        for name in ("kernel_of_parts", "parts_of_kernel"):
+            sys.modules.pop(name, None)
+        shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)  # its times have whole seconds
+        importlib.invalidate_caches()
+        found.append(importlib.import_module("kernel_of_parts").kernel(10))
+        counts.append(len(list((tmp_path / "cache").rglob("kernel_of_parts*.nbc"))))
+    assert found == [21, 71, 50, 21] and counts == [1, 2, 3, 3], "the last is the first one's"
 
 
 def test_without_a_folder_to_write_to_nothing_is_kept(install: Path, tmp_path: Path) -> None:
