@@ -82,9 +82,10 @@ def refine_pose(
     settings: Refinement = REFINEMENT,
     device: str = "cpu",
 ) -> Camera:
-    """Return the camera near `camera` that makes mean |rendered - image| over the mask `background` [H, W] smallest.
+    """Return the camera near `camera` that makes mean |g rendered + o - image| over the mask `background` [H, W] smallest.
 
-    The pose is exp(xi) w2c with xi = (rotation, translation / depth_m); the best of all steps is returned, the first
+    Gain g and offset o are those of least squares at each step: the image is of a camera that nobody calibrated, and
+    brightness that no pose explains would move it. The pose is exp(xi) w2c with xi = (rotation, translation / depth_m); the best of all steps is returned, the first
     included, so that refinement never ends worse than it began. `render_view` renders one view [1, H, W],
     differentiable in `views.w2c`. Raises UserError where the mask is empty.
     """
@@ -103,7 +104,9 @@ def refine_pose(
     with one_torch_thread():
         for step in range(settings.steps + 1):
             w2c = rigid_motion(xi * units).to(device) @ start.w2c
-            loss = ((render_view(replace(start, w2c=w2c)) - target).abs() * weight).sum()
+            rendered = render_view(replace(start, w2c=w2c))
+            gain, offset = _line(rendered.detach(), target, weight)
+            loss = ((gain * rendered + offset - target).abs() * weight).sum()
             if (value := loss.item()) < best_loss:
                 best, best_loss = w2c[0].detach().cpu().numpy(), value
             share = 0.5 * (1 + math.cos(math.pi * step / max(settings.steps, 1)))
@@ -112,3 +115,11 @@ def refine_pose(
             loss.backward()  # type: ignore[no-untyped-call]
             adam.step()
     return replace(camera, R=best[:3, :3], t=best[:3, 3])
+
+
+def _line(x: Tensor, y: Tensor, weight: Tensor) -> tuple[float, float]:
+    """Return g and o of least squares for y = g x + o; `weight` has the sum 1. Where x is even, g is 1."""
+    mean_x, mean_y = (float((v * weight).sum()) for v in (x, y))
+    spread = float((weight * (x - mean_x) ** 2).sum())
+    gain = float((weight * (x - mean_x) * (y - mean_y)).sum()) / spread if spread > 1e-12 else 1.0
+    return gain, mean_y - gain * mean_x

@@ -169,8 +169,9 @@ def off(a: Camera, b: Camera) -> float:
     return float(np.linalg.norm(a.project(points)[0] - b.project(points)[0], axis=1).mean())
 
 
-def test_refinement_finds_the_pose_from_background_pixels_alone() -> None:
-    image = render_view(Views.from_cameras([TRUE]))[0].numpy()
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (1.06, -0.02), (0.9, 0.05)])
+def test_refinement_finds_the_pose_from_background_pixels_of_any_sensor(gain: float, offset: float) -> None:
+    image = gain * render_view(Views.from_cameras([TRUE]))[0].numpy() + np.float32(offset)
     noisy = image + 0.02 * np.random.default_rng(0).standard_normal(image.shape).astype(np.float32)
     background = np.ones(image.shape, bool)
     background[20:50, 30:65] = False
