@@ -82,12 +82,12 @@ def refine_pose(
     settings: Refinement = REFINEMENT,
     device: str = "cpu",
 ) -> Camera:
-    """Return the camera near `camera` that makes mean |g rendered + o - image| over the mask `background` [H, W] smallest.
+    """Return the camera near `camera` that makes mean |g rendered + o - image| smallest over `background` [H, W].
 
     Gain g and offset o are those of least squares at each step: the image is of a camera that nobody calibrated, and
-    brightness that no pose explains would move it. The pose is exp(xi) w2c with xi = (rotation, translation / depth_m); the best of all steps is returned, the first
-    included, so that refinement never ends worse than it began. `render_view` renders one view [1, H, W],
-    differentiable in `views.w2c`. Raises UserError where the mask is empty.
+    brightness that no pose explains would move it. The pose is exp(xi) w2c with xi = (rotation, translation / depth_m);
+    the best of all steps is returned, the first included, so that refinement never ends worse than it began.
+    `render_view` renders one view [1, H, W], differentiable in `views.w2c`. Raises UserError where the mask is empty.
     """
     shape = (camera.height, camera.width)
     if image.shape != shape or background.shape != shape or not background.any():
