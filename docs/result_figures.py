@@ -40,7 +40,7 @@ SHOWN = (  # rows of a sheet: ours, the best tuned rival, and each kind of the p
 )
 COLUMNS = 8  # of the strip: truth and seven image makers
 TFP_TICKS = 40
-SHEET_WIDTH = 1700  # pixels
+SHEET_WIDTH = 1500  # pixels
 
 
 def images(strip: Path, out: Path) -> None:
@@ -126,7 +126,7 @@ def _save(figure: object, out: Path, width: int | None = None) -> None:
     image = Image.open(png).convert("RGB")
     if width is not None:
         image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
-    image.save(out, quality=85, method=6)
+    image.save(out, quality=85 if width is None else 75, method=6)
     png.unlink()
 
 
