@@ -27,9 +27,7 @@ MOST = 5  # lost ticks between two recorded spikes: each doubles the trains
 CONTEXT, NEAR_TICKS = 4, 20  # intervals on either side, and more as far as these ticks: bright pixels' are short
 CHANGES = (0.03, 0.1, 0.3, 0.6)  # of the log interval from one to the next
 TICK = 1 / 12  # ticks^2: variance of an instant within its tick
-UNKNOWN = (
-    4.0  # variance of the log interval where a side has none: the longest that it can be, or e^2 times less or more
-)
+UNKNOWN = 4.0  # variance of the log interval where a side has none: the longest that can be, or e^2 times less or more
 CERTAIN = 0.02  # probability of being wrong below which a lost tick is as good as recorded
 TIE = 1e-9  # of a log likelihood: of trains that are as likely the first counts, however sums were rounded
 

@@ -36,9 +36,7 @@ class SpikeTrains:
     words: UInt64  # [W, P] bit t & 63 of words[t >> 6, p]: pixel p fired in tick t
     before: UInt32  # [ceil(W / _COUNTED), P] spikes before word _COUNTED k
     lost: Int64  # [n_ticks + 1] filled ticks before each tick, and before the end
-    doubt_words: (
-        UInt64  # [2, ...] as `words`, of filled ticks alone, one after the other: those in doubt, and their spikes
-    )
+    doubt_words: UInt64  # [2, ...] as `words`, of filled ticks alone, in order: those in doubt, and their spikes
     doubt_before: UInt32  # [2, ...] as `before`
 
     @property
