@@ -148,9 +148,11 @@ def _numbers(option: str, value: Any) -> Iterator[tuple[str, float]]:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         for field in dataclasses.fields(value):
             name, inner = field.name.replace("_", "-"), getattr(value, field.name)
-            yield from _numbers(
-                f"{option}.{name}" if option else "" if dataclasses.is_dataclass(inner) else name, inner
-            )
+            if option:
+                name = f"{option}.{name}"
+            elif dataclasses.is_dataclass(inner):
+                name = ""
+            yield from _numbers(name, inner)
     elif isinstance(value, tuple | list):
         for item in value:
             yield from _numbers(option, item)

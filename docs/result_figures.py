@@ -24,6 +24,7 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.studies.results.blocks import NINE, of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
+from spike4dgs.studies.results.published import given_row
 from spike4dgs.studies.results.records import read_records
 
 RECORDS = Path(__file__).parent.parent / "studies" / "results" / "records"
@@ -78,8 +79,8 @@ def sensor(folder: Path, out: Path) -> None:
 def uncalibrated(out: Path) -> None:
     """Show each row's PSNR where things move with given and with estimated poses, from the records."""
     given, estimated = (_moving(group) for group in (TABLE1, UNPOSED))
-    rows = [(name, name.replace("+colmap", ""), value) for name, value in estimated.items() if "+colmap" in name]
-    rows = [(name, value, given[name]) for _, name, value in rows if name in given]
+    colmap = {given_row(name): value for name, value in estimated.items() if "+colmap" in name}
+    rows = [(name, value, given[name]) for name, value in colmap.items() if name in given]
     figure = new_figure((8, 4), "constrained")
     axes = figure.subplots()
     for y, (_, value, known) in enumerate(reversed(rows)):

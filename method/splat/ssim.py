@@ -32,7 +32,7 @@ RADIUS = SSIM_WINDOW // 2
 C1, C2 = 0.01**2, 0.03**2
 _WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SSIM_SIGMA) ** 2)
 _WINDOW /= _WINDOW.sum()
-# From the window's edge to its middle. An argument of the kernel: numba's cache would keep constants of another module.
+# From the window's edge to its middle. An argument of the kernel, as the window is another module's constant.
 _HALF = tuple(np.float32(w) for w in _WINDOW[: RADIUS + 1])
 _SHARP = 2.0**-100  # a delta at which Huber's loss is |d|, bit for bit
 _C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from statistics import fmean
 
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import make_budget
@@ -11,7 +12,7 @@ from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
 from spike4dgs.method.recipes import METHODS as OURS
 from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, Ranking, lead, rank, rows_of
+from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, Ranking, differences, lead, rank, rows_of
 from spike4dgs.studies.results.plan import ALL_ROWS, KNOWLEDGE, TABLE1, TABLE2, Group, cells_of
 from spike4dgs.studies.results.records import DIGITS, Record
 
@@ -19,6 +20,7 @@ NOTHING = "No cell of this table has been measured yet."
 NO_LEAD = "No row of ours and another with equal knowledge have been measured on all scenes yet."
 NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes), ALL_ROWS)
 _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
+_BOTH = ("psnr", RANKED_BY)
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
 _LEGEND = (
     "Ranks are by PSNR where things move; rows that the intervals do not tell apart share them. After ± is half of a "
@@ -143,16 +145,16 @@ def _cells(ranking: Ranking) -> list[list[str]]:
         [
             ranks,
             f"`{row.name}`",
-            _text(row.mean(RANKED_BY), 2),
+            moving,
             "" if row is ranking.rows[0] else _interval(behind, half),
-            _text(row.mean("psnr"), 2),
-            _text(row.mean("ssim"), 4),
-            _text(row.mean("flip"), 3),
+            psnr,
+            *others,
             _time(row, "fit_seconds"),
             _time(row, "render_fps"),
             str(len(row.seeds)),
         ]
         for row, behind, half, ranks in parts
+        for psnr, moving, *others in [_scores(row)]
     ]
 
 
@@ -173,7 +175,7 @@ def _time(row: MeasuredRow, name: str) -> str:
     return text if row.is_quiet or text == "-" else f"({text})"
 
 
-def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = ("psnr", RANKED_BY)) -> str:
+def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = _BOTH) -> str:
     """Return metrics of a scene, means over seeds; "-" where there are none."""
     cells = [r["metrics"] for (s, _), r in row.cells.items() if s == scene]
     means = []
@@ -181,6 +183,18 @@ def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = ("psnr", R
         known = [m[metric] for m in cells if metric in m]
         means.append(_text(sum(known) / len(known) if known else None, 2))
     return " / ".join(means) if cells else "-"
+
+
+def both_text(row: MeasuredRow) -> str:
+    """Return PSNR of the whole image and where things move, means over scenes and seeds; "-" of an incomplete row."""
+    return " / ".join(_text(row.mean(metric), 2) for metric in _BOTH) if row.is_complete else "-"
+
+
+def change_text(row: MeasuredRow, other: MeasuredRow) -> str:
+    """Return by how much a row is ahead of another, as `both_text`; "-" where either is incomplete."""
+    if not (row.is_complete and other.is_complete):
+        return "-"
+    return " / ".join(f"{fmean(differences(row, other, metric)):+.2f}" for metric in _BOTH)
 
 
 def _lead_text(row: MeasuredRow, rivals: Sequence[MeasuredRow]) -> str:

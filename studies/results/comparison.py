@@ -87,6 +87,12 @@ def rows_of(names: Iterable[str], scenes: Sequence[str], records: Iterable[Recor
     return [MeasuredRow(name, tuple(scenes), found) for name, found in cells.items()]
 
 
+def differences(one: MeasuredRow, other: MeasuredRow, metric: str) -> list[float]:
+    """Return the first's mean over seeds less the other's for each scene of complete rows, their scenes in order."""
+    pairs = zip(one.values(metric) or (), other.values(metric) or (), strict=True)
+    return [float(a.mean() - b.mean()) for a, b in pairs]
+
+
 def rank(rows: Sequence[MeasuredRow]) -> Ranking:
     """Return complete rows by the metric of the ranks, best first."""
     if not rows:

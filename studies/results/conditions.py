@@ -9,20 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
 import tyro
 
 from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.worlds import HARD
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, of_group, provenance, psnr_texts
-from spike4dgs.studies.results.comparison import rows_of
+from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance, psnr_texts
+from spike4dgs.studies.results.comparison import MeasuredRow, rows_of
 from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
 
 WORLDS = ("car-1", "turntable-2")
-_METRICS = ("psnr", "psnr_dynamic")
 
 
 @dataclass(frozen=True)
@@ -88,22 +86,27 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
     if not own:
         return [NOTHING]
     own += of_group(REFINED, records)
-    scores = {(r["row"], r["scene"], m): r["metrics"][m] for r in own if r["error"] is None for m in _METRICS}
     there = {r["row"] for r in own}
-    rows = [row.name for row in GROUP.rows if row.name in there]
-    first, *others = ([_means(scores, row, condition) for row in rows] for condition in CONDITIONS)
-    lines = [[CONDITIONS[0].name, "", *(_text(found, None) for found in first)]]
+    names = [row.name for row in GROUP.rows if row.name in there]
+    first, *others = (_rows(names, condition, own) for condition in CONDITIONS)
+    lines = [[CONDITIONS[0].name, "", *map(both_text, first)]]
     lines += [
-        [c.name, f"`{c.options}`", *(_text(*pair) for pair in zip(found, first, strict=True))]
-        for c, found in zip(CONDITIONS[1:], others, strict=True)
-        if any(found)
+        [condition.name, f"`{condition.options}`", *map(change_text, rows, first)]
+        for condition, rows in zip(CONDITIONS[1:], others, strict=True)
+        if any(row.is_complete for row in rows)
     ]
-    heads = ("condition", "options of `make-dataset`", *(f"`{row}`" for row in rows))
+    heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names))
     legend = (
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         "others its change."
     )
     return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP, REFINED)]
+
+
+def _rows(names: Sequence[str], condition: Condition, own: Sequence[Record]) -> list[MeasuredRow]:
+    """Return rows on a condition's scenes, those with refined held-out poses where it asks for them."""
+    suffix = SUFFIX if condition.refined else ""
+    return rows_of([f"{name}{suffix}" for name in names], condition.scenes, own)
 
 
 def content_block(records: Sequence[Record]) -> list[str]:
@@ -115,24 +118,3 @@ def content_block(records: Sequence[Record]) -> list[str]:
     lines = [[f"`{row.name}`", *(psnr_texts(row, scene) for scene in CONTENT.scenes)] for row in rows]
     legend = "PSNR of the whole image / where things move, dB."
     return [*markdown(("row", *HARD), lines), "", legend, "", provenance(own, CONTENT)]
-
-
-Means = tuple[float, float] | None
-
-
-def _means(scores: dict[tuple[str, str, str], float], row: str, condition: Condition) -> Means:
-    """Return the means of the two metrics over a condition's scenes; None where one was not measured."""
-    name = f"{row}{SUFFIX}" if condition.refined else row
-    found = [[scores.get((name, scene, m)) for scene in condition.scenes] for m in _METRICS]
-    if any(value is None for values in found for value in values):
-        return None
-    whole, moving = np.array(found, np.float64).mean(axis=1)
-    return float(whole), float(moving)
-
-
-def _text(found: Means, first: Means) -> str:
-    if found is None:
-        return "-"
-    if first is None:
-        return " / ".join(f"{x:.2f}" for x in found)
-    return " / ".join(f"{x - y:+.2f}" for x, y in zip(found, first, strict=True))

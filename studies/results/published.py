@@ -8,8 +8,8 @@ from statistics import fmean
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published, ranks
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NINE, NOTHING, of_group, provenance
-from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
+from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, change_text, of_group, provenance
+from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, differences, rows_of
 from spike4dgs.studies.results.plan import TABLE1, TABLE5, UNPOSED, Group
 from spike4dgs.studies.results.records import Record
 
@@ -25,11 +25,9 @@ def published_block(group: Group, number: int, records: Sequence[Record]) -> lis
     Ranks are among the rows that the paper has.
     """
     table, own = published(number), of_group(group, records)
-    rows = [
-        row
-        for row in rows_of([name for name in table.rows if name in _names(group)], group.scenes, own)
-        if row.is_complete
-    ]
+    planned = _names(group)
+    rows = rows_of([name for name in table.rows if name in planned], group.scenes, own)
+    rows = [row for row in rows if row.is_complete]
     in_paper = [row for row in rows if table.rows[row.name]]
     if not in_paper:
         return [NOTHING]
@@ -71,21 +69,25 @@ def _compared(
     return column, f"{METRICS[metric].title} {kendalltau(*zip(*pairs, strict=True)).statistic:.2f}"
 
 
+def given_row(name: str) -> str:
+    """Return the row that is given the poses that another estimates."""
+    return _GIVEN.get(name, name.replace("+colmap", ""))
+
+
 def unposed_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of table 1 with estimated poses, each row beside the one that is given them."""
     own = of_group(UNPOSED, records)
     rows = [row for row in rows_of(_names(UNPOSED), UNPOSED.scenes, own) if row.is_complete]
     if not rows:
         return [NOTHING]
-    partners = {row.name: _GIVEN.get(row.name, row.name.replace("+colmap", "")) for row in rows}
+    partners = {row.name: given_row(row.name) for row in rows}
     given = {row.name: row for row in rows_of(partners.values(), TABLE1.scenes, of_group(TABLE1, records))}
     rows.sort(key=lambda row: -(row.mean(RANKED_BY) or 0.0))
     lines = []
     for row in rows:
         partner = given[partners[row.name]]
-        changes = [_differences(row, partner, metric) for metric in ("psnr", RANKED_BY)] if partner.is_complete else []
-        lost = [f"{fmean(each):+.2f}" for each in changes] or ["-"]
-        lines.append([f"`{row.name}`", _both(row), f"{row.mean('ssim'):.4f}", f"`{partner.name}`", " / ".join(lost)])
+        texts = both_text(row), f"{row.mean('ssim'):.4f}", f"`{partner.name}`", change_text(row, partner)
+        lines.append([f"`{row.name}`", *texts])
     heads = ("row", "PSNR / moving", "SSIM", "given poses", "change of PSNR / moving, dB")
     return [*markdown(heads, lines), "", provenance(own, UNPOSED)]
 
@@ -95,7 +97,7 @@ def views_block(records: Sequence[Record]) -> list[str]:
     own = [of_group(group, records) for group in TABLE5]
     measured = [rows_of(_names(group), group.scenes, found) for group, found in zip(TABLE5, own, strict=True)]
     lines = [
-        [f"`{rows[0].name}`", *(_both(row) if row.is_complete else "-" for row in rows)]
+        [f"`{rows[0].name}`", *(both_text(row) for row in rows)]
         for rows in zip(*measured, strict=True)
         if any(row.is_complete for row in rows)
     ]
@@ -124,19 +126,9 @@ def pairs_block(records: Sequence[Record]) -> list[str]:
 def _pair(one: MeasuredRow, other: MeasuredRow) -> list[str]:
     """Return a line: by how much the first is ahead in the mean, and on how many scenes."""
     texts = []
-    for each in (_differences(one, other, metric) for metric in ("psnr", RANKED_BY)):
+    for each in (differences(one, other, metric) for metric in ("psnr", RANKED_BY)):
         texts += [f"{fmean(each):+.2f}", str(sum(x > 0 for x in each))]
     return [f"`{one.name}`", f"`{other.name}`", *texts]
-
-
-def _differences(one: MeasuredRow, other: MeasuredRow, metric: str) -> list[float]:
-    """Return the first's mean over seeds less the other's for each scene of complete rows."""
-    pairs = zip(one.values(metric) or (), other.values(metric) or (), strict=True)
-    return [float(a.mean() - b.mean()) for a, b in pairs]
-
-
-def _both(row: MeasuredRow) -> str:
-    return f"{row.mean('psnr'):.2f} / {row.mean(RANKED_BY):.2f}"
 
 
 def _names(group: Group) -> list[str]:

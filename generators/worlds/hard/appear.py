@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.base import Part, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import box, ellipsoid, revolve, rotation, translation
-from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, room
+from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, low_rig, room
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2
 from spike4dgs.generators.worlds.surfaces import Lamp, Material
 from spike4dgs.generators.worlds.textures import cloth, wood
@@ -71,9 +71,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         emitters=run.lamp.emitters(),
         poses=poses,
         exposure=1.25,
-        rig=RigSpec(
-            center=(0.0, -1.3, 0.62), target=(0.0, 0.0, 0.24), spacing_m=(0.075, 0.065), toe_in=0.8, fov_x_deg=42.0
-        ),
+        rig=low_rig(1.3, 0.24),
         shadow_sources=run.lamp.points,
         depth_range=(0.6, 5.0),
         notes={"speed_m_s": run.speed_m_s, "length_m": 0.09, "spin_rad_s": run.spin_rad_s},

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.base import Deforming, Part, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import ellipsoid, merge, revolve
-from spike4dgs.generators.worlds.parts.desk import room
+from spike4dgs.generators.worlds.parts.desk import low_rig, room
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2, owners
 from spike4dgs.generators.worlds.surfaces import Colour, Lamp, Material
 
@@ -76,9 +76,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         emitters=burst.lamp.emitters(),
         poses=lambda t_s: {},
         exposure=1.25,
-        rig=RigSpec(
-            center=(0.0, -1.2, 0.62), target=(0.0, 0.0, 0.26), spacing_m=(0.075, 0.065), toe_in=0.8, fov_x_deg=42.0
-        ),
+        rig=low_rig(1.2, 0.26),
         shadow_sources=burst.lamp.points,
         depth_range=(0.3, 5.0),
         notes={

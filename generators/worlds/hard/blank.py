@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.base import Part, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import quad, revolve, rotation, translation, tube
+from spike4dgs.generators.worlds.parts.desk import low_rig
 from spike4dgs.generators.worlds.surfaces import Colour, Lamp, Material
 
 _OUTSIDE = (0.0, 0.0), (0.06, 0.0), (0.095, 0.06), (0.09, 0.12), (0.05, 0.175), (0.06, 0.20)
@@ -69,9 +70,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         emitters=throw.lamp.emitters(),
         poses=poses,
         exposure=1.25,
-        rig=RigSpec(
-            center=(0.0, -1.25, 0.62), target=(0.0, 0.0, 0.18), spacing_m=(0.075, 0.065), toe_in=0.8, fov_x_deg=42.0
-        ),
+        rig=low_rig(1.25, 0.18),
         shadow_sources=throw.lamp.points,
         depth_range=(0.6, 5.0),
         notes={"speed_m_s": throw.speed_m_s, "length_m": _HEIGHT_M, "spin_rad_s": abs(throw.spin_rad_s)},

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.worlds.base import Flash, Part, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.base import Flash, Part, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import box, rotation, translation
-from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, room
+from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, low_rig, room
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2
 from spike4dgs.generators.worlds.surfaces import Lamp, Material
 
@@ -84,9 +84,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         emitters=lamp.emitters(0.7),
         poses=poses,
         exposure=1.25,
-        rig=RigSpec(
-            center=(0.0, -1.25, 0.62), target=(0.0, 0.0, 0.2), spacing_m=(0.075, 0.065), toe_in=0.8, fov_x_deg=42.0
-        ),
+        rig=low_rig(1.25, 0.2),
         shadow_sources=lamp.points,
         depth_range=(0.6, 5.0),
         notes={

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from spike4dgs.generators.worlds.base import Part, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.base import Part, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import Mesh, box, ellipsoid, merge, quad, rotation, translation
-from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, room
+from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, low_rig, room
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2
 from spike4dgs.generators.worlds.surfaces import Material
 from spike4dgs.generators.worlds.textures import cloth, paving
@@ -74,9 +74,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         emitters=_emitters(position),
         poses=poses,
         exposure=1.25,
-        rig=RigSpec(
-            center=(0.0, -1.25, 0.62), target=(0.0, 0.0, 0.2), spacing_m=(0.075, 0.065), toe_in=0.8, fov_x_deg=42.0
-        ),
+        rig=low_rig(1.25, 0.2),
         shadow_sources=np.array([[*position, 1.0]]),
         depth_range=(0.6, 5.0),
         notes={"speed_m_s": throw.speed_m_s, "length_m": 0.09, "spin_rad_s": abs(throw.spin_rad_s)},

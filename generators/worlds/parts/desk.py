@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spike4dgs.generators.worlds.base import Part
+from spike4dgs.generators.worlds.base import Part, RigSpec
 from spike4dgs.generators.worlds.meshes import (
     box,
     ellipsoid,
@@ -20,6 +20,17 @@ from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, mix, pa
 
 INK: tuple[Colour, ...] = ((0.55, 0.04, 0.03), (0.03, 0.07, 0.35), (0.03, 0.20, 0.07), (0.03, 0.03, 0.03))
 BLOCKS: tuple[Colour, ...] = ((0.75, 0.22, 0.14), (0.20, 0.50, 0.24), (0.78, 0.58, 0.12), (0.16, 0.32, 0.66))
+
+
+def low_rig(distance_m: float, target_z_m: float) -> RigSpec:
+    """Return cameras that look at the middle of the desk from a little above it."""
+    return RigSpec(
+        center=(0.0, -distance_m, 0.62),
+        target=(0.0, 0.0, target_z_m),
+        spacing_m=(0.075, 0.065),
+        toe_in=0.8,
+        fov_x_deg=42.0,
+    )
 
 
 def room(rng: np.random.Generator) -> dict[str, Part]:
