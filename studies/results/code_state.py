@@ -18,7 +18,15 @@ from spike4dgs.studies.results.records import DIGITS
 
 ROOT = Path(__file__).resolve().parents[2]
 # What decides about a number. Records, pages and tests may change while a sweep runs.
-CODE = ("benchmark", "method", "baselines", "studies/results/*.py", "pyproject.toml", "constraints.txt")
+CODE = (
+    "benchmark",
+    "method",
+    "baselines",
+    "studies/results/*.py",
+    "studies/images.py",
+    "pyproject.toml",
+    "constraints.txt",
+)
 _DO = "clone the repository, and run `pip install -e .` there"
 
 

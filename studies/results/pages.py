@@ -11,6 +11,7 @@ from spike4dgs.benchmark.files import write_text
 from spike4dgs.studies.kit.blocks import pattern
 from spike4dgs.studies.results.blocks import NINE, headline_block, home_block, lead_block, scenes_block, table_block
 from spike4dgs.studies.results.conditions import conditions_block, content_block
+from spike4dgs.studies.results.images import images_block
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, TABLE3, TABLE4, TABLE7
 from spike4dgs.studies.results.published import pairs_block, published_block, unposed_block, views_block
 from spike4dgs.studies.results.records import Record
@@ -31,6 +32,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "table3": lambda records: published_block(TABLE3, 3, records),
     "table4": lambda records: published_block(TABLE4, 4, records),
     "table5": views_block,
+    "table6": images_block,
     "table7": lambda records: published_block(TABLE7, 7, records),
     "unposed": unposed_block,
 }

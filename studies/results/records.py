@@ -31,13 +31,14 @@ def scores_of(cell: Scored) -> Record:
     """Return the part of a record that a scored cell tells: metrics, costs, and why there are none."""
     metrics = {name: value for name in METRICS if (value := cell["metrics"].get(name)) is not None}
     return {
-        "metrics": {name: _short(value) for name, value in metrics.items()},
-        **{name: None if (value := cell[name]) is None else _short(value) for name in COSTS},
+        "metrics": {name: short(value) for name, value in metrics.items()},
+        **{name: None if (value := cell[name]) is None else short(value) for name in COSTS},
         "error": None if cell["status"] == "ok" else f"{cell['status']}: {cell['error']}"[:_MOST_ERROR],
     }
 
 
-def _short(value: float) -> float:
+def short(value: float) -> float:
+    """Return a number with the digits that records have."""
     return float(f"{value:.6g}")
 
 

@@ -27,6 +27,8 @@ from spike4dgs.benchmark.runs.run import JobFiles, Settings, check_inputs, run_c
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.entry import typical_fit_seconds
 from spike4dgs.studies.results.code_state import CodeState, code_digest
+from spike4dgs.studies.results.images import SUFFIX as IMAGES
+from spike4dgs.studies.results.images import measure_images
 from spike4dgs.studies.results.plan import Cell, knowledge_of
 from spike4dgs.studies.results.records import (
     DIGITS,
@@ -88,7 +90,11 @@ def sweep(
         console.print(f"{len(cells)} cells planned, {len(here) - len(todo)} measured, {len(todo)} to measure")
         codes = {name: code_digest(name) for name in dict.fromkeys(cell.row for cell in here)}
         _say_other_code(here, records, codes, console)
-        _measure(todo, scenes, revisions, methods, codes, state, settings, records, console)
+        kept = _Kept(scenes, revisions, codes, state, settings, records)
+        for cell in todo:
+            if cell.row.endswith(IMAGES):
+                kept.keep(cell, measure_images(cell.row, scenes[cell.scene]))
+        _measure([cell for cell in todo if not cell.row.endswith(IMAGES)], methods, kept, console)
         failed = [r for r in map(records.get, map(_key, here)) if r and (r["error"] or "").startswith(FAILED)]
         left = sum(_key(cell) not in records for cell in cells)
         return Outcome(left, tuple(f"{r['row']} on {r['scene']}, seed {r['seed']}: {r['error']}" for r in failed))
@@ -128,29 +134,60 @@ def _say_other_code(
         console.print(f"kept, measured by other code: {names}; remove a row's file to measure it anew", markup=False)
 
 
-def _measure(
-    todo: Sequence[Cell],
-    scenes: Mapping[str, Scene],
-    revisions: Mapping[str, str],
-    methods: Mapping[str, Method],
-    codes: Mapping[str, str],
-    state: CodeState,
-    settings: SweepSettings,
-    records: dict[Key, Record],
-    console: Console,
-) -> None:
-    """Fit and score the cells, and write each into its row's file and into `records` at once."""
+@dataclass(frozen=True)
+class _Kept:
+    """What is known of the cells, and their records so far."""
+
+    scenes: Mapping[str, Scene]
+    revisions: Mapping[str, str]
+    codes: Mapping[str, str]
+    state: CodeState
+    settings: SweepSettings
+    records: dict[Key, Record]
+
+    def keep(self, cell: Cell, measured: Record) -> None:
+        """Write a measured cell into its row's file and into `records`.
+
+        Raises UserError where the code is no longer what was to be measured.
+        """
+        if (found := code_digest(cell.row)) != self.codes[cell.row]:
+            fix = "start again; a sweep needs a checkout that nobody edits"
+            raise problem("the methods' code", self.codes[cell.row], f"{found}: it changed meanwhile", fix)
+        revision, own = self.revisions[cell.scene], self.scenes[cell.scene].revision[:DIGITS]
+        record: Record = {
+            "row": cell.row,
+            "scene": cell.scene,
+            "revision": revision,
+            **({"equivalent": own} if own != revision else {}),
+            "seed": cell.seed,
+            "budget": make_budget(cell.budget).label,
+            "split": cell.split,
+            "commit": self.state.commit,
+            **({"dirty": True} if self.state.dirty else {}),
+            "code": found,
+            "tuned_on": cell.tuned_on,
+            **measured,
+            "quiet": self.settings.quiet,
+            "cpu": cpu_name(),
+        }
+        self.records[key_of(record)] = record
+        write_row(self.settings.records, cell.row, self.records.values())
+
+
+def _measure(todo: Sequence[Cell], methods: Mapping[str, Method], kept: _Kept, console: Console) -> None:
+    """Fit and score the cells, and keep each at once."""
+    settings = kept.settings
     jobs = [
         JobFiles(
             Job(
                 get_method(cell.row.removesuffix(REFINED), methods),
-                scenes[cell.scene],
+                kept.scenes[cell.scene],
                 cell.seed,
                 DEVICE,
                 make_budget(cell.budget),
                 refined=cell.row.endswith(REFINED),
             ),
-            settings.out / codes[cell.row] / f"{cell.budget}-{cell.split}" / f"seed-{cell.seed}",
+            settings.out / kept.codes[cell.row] / f"{cell.budget}-{cell.split}" / f"seed-{cell.seed}",
             settings.quiet,  # its times are of one whole fit
             Apart(),
         )
@@ -160,30 +197,8 @@ def _measure(
     shared = Settings(settings.out, workers=settings.workers)
     with RunDisplay(console, len(jobs), [cell.row for cell in todo], typical_fit_seconds()) as display:
         for k, scored in run_cells(jobs, shared, selection, display):
-            cell, job = todo[k], jobs[k].job
-            if (found := code_digest(cell.row)) != codes[cell.row]:
-                fix = "start again; a sweep needs a checkout that nobody edits"
-                raise problem("the methods' code", codes[cell.row], f"{found}: it changed meanwhile", fix)
-            revision, own = revisions[cell.scene], job.scene.revision[:DIGITS]
-            record: Record = {
-                "row": cell.row,
-                "scene": cell.scene,
-                "revision": revision,
-                **({"equivalent": own} if own != revision else {}),
-                "seed": cell.seed,
-                "budget": job.budget.label,
-                "split": cell.split,
-                "commit": state.commit,
-                **({"dirty": True} if state.dirty else {}),
-                "code": found,
-                "tuned_on": cell.tuned_on,
-                "knowledge": knowledge_of(job.method),
-                **scores_of(scored[-1 if job.refined else 0]),
-                "quiet": settings.quiet,
-                "cpu": cpu_name(),
-            }
-            records[key_of(record)] = record
-            write_row(settings.records, cell.row, records.values())
+            job = jobs[k].job
+            kept.keep(todo[k], {"knowledge": knowledge_of(job.method), **scores_of(scored[-1 if job.refined else 0])})
             if settings.limit_hours is not None and time.monotonic() - start > 3600 * settings.limit_hours:
                 display.say(f"--limit-hours {settings.limit_hours:g}: no further cell is begun")
                 return

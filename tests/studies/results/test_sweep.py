@@ -17,9 +17,11 @@ import pytest
 from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, run, wait_for
 from nosy_methods import Refines
 from rich.console import Console
+from skimage.metrics import peak_signal_noise_ratio
 from small_scenes import write_small_scene
 
 from spike4dgs import baselines, benchmark, method
+from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Method
 from spike4dgs.benchmark.release.fingerprint import compare, read_fingerprint, write_fingerprint
@@ -237,3 +239,18 @@ def test_a_method_of_ours_does_not_change_with_the_baselines() -> None:
     ours, rooms = code_digest("spike4dgs-x"), [benchmark, method, baselines]
     assert sources_sha256(rooms[:2]).startswith(ours) and ours != code_digest("tfp+stg")
     assert sources_sha256(rooms).startswith(code_digest("tfp+stg")) and len(ours) == 12
+
+
+def test_images_are_measured_without_a_fit_and_corrected_where_the_camera_is_known(folder: Path) -> None:
+    outcome, records, _ = swept(folder, cells("tfp.images", "tfp+rig-flat.images"), {})
+    assert (outcome.left, outcome.failed) == (0, ())
+    plain, corrected = sorted(records.values(), key=lambda r: r["knowledge"], reverse=True)
+    scene = open_scene(folder / "pattern-0")
+    pairs = [
+        (scene.ground_truth(t), IMAGES["tfp"](scene.stream(t.camera), [t.tick], scene.radiance_gain)[0])
+        for t in scene.targets
+    ]
+    expected = [peak_signal_noise_ratio(*np.clip(pair, 0, 1).astype(float), data_range=1) for pair in pairs]
+    assert plain["metrics"]["psnr"] == pytest.approx(np.mean(expected), abs=1e-3) and plain["error"] is None
+    assert plain["render_fps"] > 0 and plain["fit_seconds"] is None
+    assert corrected["error"] == "skipped: no calibration recordings of a held-out camera" and not corrected["metrics"]
