@@ -98,7 +98,7 @@ def _scores(row: MeasuredRow) -> list[str]:
 
 def _ms(row: MeasuredRow) -> str:
     fps = row.mean_cost("render_fps")
-    text = f"{1000 / fps:.2g}" if fps else "-"
+    text = "-" if not fps else f"{1000 / fps:.2g}" if fps > 100 else f"{1000 / fps:.0f}"
     return text if row.is_quiet else f"({text})"
 
 
