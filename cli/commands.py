@@ -184,7 +184,7 @@ COMMANDS: dict[str, Command] = {
     "download": Command(
         "spike4dgs.cli.download:download",
         "fetch the scenes of a track or a release, or parts of them",
-        "download outdoor-small --from https://example.org/spike4dgs/1 --out data",
+        "download ideal --from https://example.org/spike4dgs/2 --out data",
     ),
     "download weights": Command(
         "spike4dgs.cli.download_weights:download_weights",
@@ -194,17 +194,17 @@ COMMANDS: dict[str, Command] = {
     "release pack": Command(
         "spike4dgs.cli.release:pack",
         "pack scenes into a release that people can download",
-        "release pack data/car-0-small data/turntable-0-small --out releases/1",
+        "release pack data/car-0-small data/turntable-0-small --out releases/2",
     ),
     "release check": Command(
         "spike4dgs.cli.release:check",
         "check a release: a host's limits, its index, every byte",
-        "release check releases/1",
+        "release check releases/2",
     ),
     "release publish": Command(
         "spike4dgs.cli.release:publish",
         "upload a release to Zenodo, Hugging Face or a web server; with --dry-run show what would be sent",
-        "release publish releases/1 --to zenodo-sandbox --dry-run",
+        "release publish releases/2 --to zenodo-sandbox --dry-run",
     ),
     "release wheel": Command(
         "spike4dgs.cli.release:wheel",
@@ -214,7 +214,7 @@ COMMANDS: dict[str, Command] = {
     "release fingerprint": Command(
         "spike4dgs.cli.release:fingerprint",
         "write small files by which scenes made on other processors are recognised",
-        "release fingerprint data/car-0-small --out leaderboard/releases/1",
+        "release fingerprint data/car-0-small --out leaderboard/releases/2",
     ),
     "verify": Command(
         "spike4dgs.cli.verify:verify",

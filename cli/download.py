@@ -33,7 +33,7 @@ def download(
     weight files.
 
     Args:
-        track: A track such as outdoor-small, whose revisions the release must have; or all scenes of the release.
+        track: A track such as ideal, whose revisions the release must have; or all scenes of the release.
         source: Where the release lies: https://..., hf://datasets/OWNER/NAME, s3://..., file://... or a path;
             SPIKE4DGS_RELEASE if left out.
         out: Folder for the scenes.

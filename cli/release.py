@@ -20,6 +20,7 @@ from spike4dgs.benchmark.release.source import size_text
 from spike4dgs.benchmark.release.wheel import write_wheel
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.scene.scene import open_scenes
+from spike4dgs.leaderboard.tracks import scene_name
 
 
 def pack(
@@ -118,10 +119,10 @@ def fingerprint(scenes: Positional[tuple[Path, ...]], *, out: Path) -> int:
 
     Args:
         scenes: Scene folders of a release.
-        out: Folder of the fingerprints, OUT/SCENE.npz.
+        out: Folder of the fingerprints, OUT/SCENE@REVISION.npz.
     """
     for scene in open_scenes(scenes, allow_gaps=True):
-        path = out / f"{scene.id}.npz"
+        path = out / f"{scene_name(scene.id, scene.revision)}.npz"
         write_fingerprint(path, make_fingerprint(scene))
         print(f"{path}: {size_text(path.stat().st_size)}, sha256 {sha256_file(path)}")
     return 0

@@ -49,7 +49,7 @@ class SceneChoice:
         table: Instead of scenes, a table of the paper: 1 (outdoor), 2 (objects), 3 (components), 4 (supervision), 5
             (number of views; plotted in views.png), 6 (images from spikes), 7 (MSDI without SPSS).
         poses: Of table 1 or 2: given (methods get the rig's poses) or estimated (each estimates its own).
-        track: Instead of scenes, a track such as outdoor-small: its scenes in DATA; those that are missing are
+        track: Instead of scenes, a track such as ideal: its scenes in DATA; those that are missing are
             downloaded.
         source: Where the release with the track's scenes lies; SPIKE4DGS_RELEASE if left out.
         data: Folder of the table's or track's scenes.

@@ -3,14 +3,14 @@
     LEADERBOARD/entries/RELEASE-TRACK@REVISION/METHOD.json          of a track
     LEADERBOARD/entries/RELEASE-TRACK@REVISION/METHOD@seed-K.json   another seed than 0
     LEADERBOARD/local/SCENE+N@REVISION/METHOD.json                  of any other scenes, revisions or split
-    LEADERBOARD/archive/SCENE+N@REVISION/METHOD.json                from before release 1
+    LEADERBOARD/archive/SCENE+N@REVISION/METHOD.json                of an earlier release
 
 REVISION begins the hash of the scenes' revisions and the split (`tracks.dataset_revision`). Paths follow from the
 record's scenes, revisions, split, method and seed alone. Hidden files are no entries: a killed process may leave some.
 
 LEADERBOARD/LEDGER has a line for every entry that `submit` wrote, so that one that was edited by hand is noticed:
 
-    <sha256 of the entry's canonical JSON>  entries/1-outdoor-small@0123456789ab/tfp+4dgs.json
+    <sha256 of the entry's canonical JSON>  entries/2-ideal@0123456789ab/tfp+4dgs.json
 
 Lines are sorted and never removed. Who edits an entry and the ledger alike is noticed only when the entry is verified
 again from its predictions.

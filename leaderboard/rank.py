@@ -2,7 +2,7 @@
 
     leaderboard.json   the boards of the release's tracks
     local.json         boards of other scenes, revisions or splits, with the reason
-    archive.json       entries from before release 1, without ranks
+    archive.json       entries of earlier releases, without ranks
 
 A row is a method: the mean over the seeds of those of its entries that may be ranked and have one configuration, which
 is equal code, parameters and verification. Those are re-scored or re-fitted, complete, and without flags, which follow
@@ -45,7 +45,7 @@ COPY, NOISE, CEILING, RENDERED, TRAINED = (
     "as near to the truth as another rendering",
     "trained on test scenes",
 )
-_BEFORE = "before release 1: these scenes' bytes are not those of the release"
+_BEFORE = "of an earlier release: these scenes' bytes are not those of the current one"
 
 
 def write_boards(leaderboard: Path) -> dict[str, dict[str, Any]]:
@@ -269,7 +269,7 @@ def _code(harness: Mapping[str, Any]) -> str:
 
 
 def standing(boards: Mapping[str, Mapping[str, Any]], path: str) -> str:
-    """Return where the entry at `path` stands, such as "rank 1 of 3 on outdoor-small (release 1, revision ...)"."""
+    """Return where the entry at `path` stands, such as "rank 1 of 3 on ideal (release 2, revision ...)"."""
     found = []
     for folder, file in boards.items():
         for board in file["boards"]:

@@ -1,8 +1,10 @@
 """The tracks of a release: frozen lists of scenes with their revisions, and the place of a record among them.
 
-    leaderboard/releases/1.json       the tracks
-    leaderboard/releases/1/SCENE.npz  the fingerprint of a scene
-    leaderboard/releases/SHA256SUMS   the files' hashes: a release does not change
+    leaderboard/releases/2.json                the tracks
+    leaderboard/releases/2/SCENE@REVISION.npz  the fingerprint of a scene
+    leaderboard/releases/SHA256SUMS            the files' hashes: a release does not change
+
+Tracks may have scenes of one id and several revisions: the same world, rendered otherwise.
 
 A record of exactly a track's scenes, revisions and split is public. So is one of equivalent scenes, which a processor
 that rounds otherwise made: their fingerprints say so, and the record gets the release's revisions and the share of
@@ -31,7 +33,7 @@ from spike4dgs.benchmark.untrusted import is_id
 
 SHIPPED = Path(str(files("spike4dgs.leaderboard")))  # the released entries, as the package holds them
 FOLDER = SHIPPED / "releases"
-RELEASE = "1"
+RELEASE = "2"
 PUBLIC, LOCAL, ARCHIVE = "entries", "local", "archive"
 REVISION_DIGITS = 12  # of revisions in paths and messages
 CHANGED = "the method ran with other settings (--set); a track takes it as a recipe with a name of its own"
@@ -59,11 +61,16 @@ class Release:
 
     number: str
     tracks: tuple[Track, ...]
-    ceilings_db: Mapping[str, float]
+    ceilings_db: Mapping[str, float]  # by `scene_name`
 
     def ceiling_db(self, scene: str, revision: str) -> float | None:
         """Return a scene's noise ceiling; None where it is not known, or where the revision is not the release's."""
-        return self.ceilings_db.get(scene) if self._has(scene, revision) else None
+        return self.ceilings_db.get(scene_name(scene, revision)) if self._has(scene, revision) else None
+
+    def revisions(self, scene: str) -> tuple[str, ...]:
+        """Return the revisions that tracks have of a scene, each once; none of an announced one."""
+        known = (track.scenes.get(scene) for track in self.tracks)
+        return tuple(dict.fromkeys(revision for revision in known if revision is not None))
 
     def sensor(self, scene: str, revision: str) -> str | None:
         """Return the sensor of a scene (`runs.record.SENSORS`); None where the revision is not the release's.
@@ -73,7 +80,7 @@ class Release:
         return NOISY if self._has(scene, revision) else None
 
     def _has(self, scene: str, revision: str) -> bool:
-        return any(track.scenes.get(scene) == revision for track in self.tracks)
+        return revision in self.revisions(scene)
 
 
 @dataclass(frozen=True)
@@ -118,17 +125,21 @@ def _check_frozen(folder: Path, path: Path) -> None:
 
 
 def match_release(scene: Scene) -> Match | None:
-    """Return how a scene compares with the current release's of the same id by its fingerprint.
+    """Return how a scene compares with the current release's of the same id by its fingerprint, the nearest of several.
 
-    None where that scene has the same revision, is in no release, or has no fingerprint there.
+    None where the release has the scene's revision, has none of the id, or has no fingerprint of it.
     """
-    known = {name: revision for track in current_release().tracks for name, revision in track.scenes.items()}
-    path = FOLDER / RELEASE / f"{scene.id}.npz"
-    if known.get(scene.id, scene.revision) == scene.revision or not path.is_file():
+    known = current_release().revisions(scene.id)
+    if scene.revision in known:
         return None
-    _check_frozen(FOLDER, path)
-    match = compare(scene, read_fingerprint(path))
-    return match if match.revision == known[scene.id] else None
+    found = []
+    for revision in known:
+        path = FOLDER / RELEASE / f"{scene_name(scene.id, revision)}.npz"
+        if path.is_file():
+            _check_frozen(FOLDER, path)
+            match = compare(scene, read_fingerprint(path))
+            found += [match] if match.revision == revision else []
+    return min(found, key=lambda match: (not match.is_equivalent, match.bits), default=None)
 
 
 def is_equivalent(scene: Scene) -> bool:
@@ -150,11 +161,11 @@ def with_equivalents(record: Record, scenes: Sequence[Scene]) -> Record:
 
 def release_line(scenes: Sequence[Scene]) -> str | None:
     """Return which of some scenes are those of the current release, in one line; None where it has none of them."""
-    known = {name: revision for track in current_release().tracks for name, revision in track.scenes.items()}
+    known = {scene: revisions for scene in scenes if (revisions := current_release().revisions(scene.id))}
     found: dict[str, list[str]] = {}
-    for scene in (s for s in scenes if known.get(s.id)):
+    for scene, revisions in known.items():
         match = match_release(scene)
-        if scene.revision == known[scene.id]:
+        if scene.revision in revisions:
             found.setdefault("as released", []).append(scene.id)
         elif match and match.is_equivalent:
             found.setdefault("equivalent, by rounding", []).append(f"{scene.id} ({match.bits:.3%} of the bits differ)")
@@ -200,6 +211,15 @@ def short(revision: str) -> str:
     return revision[:REVISION_DIGITS]
 
 
+def scene_name(scene: str, revision: str) -> str:
+    """Return the name of a released scene: its id and the first digits of its revision.
+
+    >>> scene_name("car-0-small", "b6785e89cd0396d9")
+    'car-0-small@b6785e89cd03'
+    """
+    return f"{scene}@{short(revision)}"
+
+
 def place_of(record: Mapping[str, Any]) -> Place:
     """Return where a record's entry belongs.
 
@@ -229,11 +249,10 @@ def why_local(dataset: Mapping[str, Any], release: Release, same: list[Track]) -
     number = f"release {release.number}"
     if same:
         return f"the method was given what {', '.join(t.name for t in same)} of {number} withholds"
-    known = {scene: revision for t in release.tracks for scene, revision in t.scenes.items() if revision}
     other = [
-        f"{scene}: revision {short(revision)} here, {short(known[scene])} in {number}"
+        f"{scene}: revision {short(revision)} here, {' or '.join(map(short, known))} in {number}"
         for scene, revision in sorted(dataset["scenes"].items())
-        if scene in known and known[scene] != revision
+        if (known := release.revisions(scene)) and revision not in known
     ]
     if other:
         more = f"; and {len(other) - _NAMED} more" if len(other) > _NAMED else ""

@@ -102,8 +102,8 @@ def _check_scene(scene: Scene, dataset: Mapping[str, Any]) -> None:
         raise problem(scene.root, f"scene revision {revision[:16]}...", f"{scene.revision[:16]}...", fix)
     if equivalent and scene.revision == revision:
         match = match_release(scene)
-        if match is None or not match.is_equivalent:
-            found = match.reasons[0] if match else "no fingerprint to compare with"
+        if match is None or not match.is_equivalent or match.revision != equivalent["revision"]:
+            found = next(iter(match.reasons), match.revision[:16]) if match else "no fingerprint to compare with"
             expected = f"a scene that is equivalent to revision {equivalent['revision'][:16]}..."
             raise problem(scene.root, expected, found, "submit the record again, with its scenes")
 

@@ -126,7 +126,8 @@ def published_values(board: Board) -> dict[str, Any] | None:
             for metric in table.metrics:
                 values = [table.value(row.first["method"]["name"], world, metric) for world in worlds]
                 if any(v is not None for v in values):
-                    found.setdefault(str(i), {})[metric] = values
+                    other = found.setdefault(str(i), {}).get(metric) or [None] * len(worlds)  # of another table
+                    found[str(i)][metric] = [a if b is None else b for a, b in zip(other, values, strict=True)]
     return {"source": " ".join(sources), "names": names, "rows": found} if found else None
 
 

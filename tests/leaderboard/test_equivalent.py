@@ -17,7 +17,7 @@ from spike4dgs.benchmark.release.fingerprint import make_fingerprint, write_fing
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard import tracks
-from spike4dgs.leaderboard.tracks import current_release, match_release, release_line
+from spike4dgs.leaderboard.tracks import RELEASE, current_release, match_release, release_line, scene_name
 from spike4dgs.leaderboard.verify import verify_leaderboard
 
 SCENES = ("s0", "s1")
@@ -35,9 +35,10 @@ def ship(done: Path, monkeypatch: pytest.MonkeyPatch, share: float) -> Path:
     write_manifest(data / "s0")
     scenes = [open_scene(data / name) for name in SCENES]
     folder = write_release(done / "releases", {"patterns": track({s.id: s.revision for s in scenes})})
-    for scene in scenes:
-        write_fingerprint(folder / f"1/{scene.id}.npz", make_fingerprint(scene))
-    names = ["1.json", *(f"1/{s.id}.npz" for s in scenes)]
+    prints = {f"{RELEASE}/{scene_name(s.id, s.revision)}.npz": s for s in scenes}
+    for name, scene in prints.items():
+        write_fingerprint(folder / name, make_fingerprint(scene))
+    names = [f"{RELEASE}.json", *prints]
     lines = [f"{hashlib.sha256((folder / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
     (folder / "SHA256SUMS").write_text("".join(lines))
     monkeypatch.setattr(tracks, "FOLDER", folder)
@@ -50,7 +51,7 @@ def test_a_result_of_equivalent_scenes_is_on_the_track_and_says_so(
 ) -> None:
     data = ship(done, monkeypatch, 1e-4)
     entry = read(enter(done))
-    assert "rank 1 of 1 on patterns (release 1" in (said := capsys.readouterr().out)
+    assert "rank 1 of 1 on patterns (release 2" in (said := capsys.readouterr().out)
     assert "on equivalent scenes (bits that differ: pattern-0 0.0" in said
     dataset = entry["record"]["dataset"]
     own, released = (open_scene(folder / "s0") for folder in (done, data))
@@ -116,6 +117,7 @@ def test_an_entry_that_claims_it_fails_when_its_scenes_are_compared(
 
 def test_a_fingerprint_that_was_exchanged_is_refused(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ship(done, monkeypatch, 0.1)
-    write_fingerprint(tracks.FOLDER / "1/pattern-0.npz", make_fingerprint(open_scene(done / "s0")))
-    with pytest.raises(UserError, match=r"pattern-0\.npz: expected the bytes whose hash SHA256SUMS lists"):
+    (path,) = (tracks.FOLDER / RELEASE).glob("pattern-0@*.npz")
+    write_fingerprint(path, make_fingerprint(open_scene(done / "s0")))
+    with pytest.raises(UserError, match=r"pattern-0@.*\.npz: expected the bytes whose hash SHA256SUMS lists"):
         match_release(open_scene(done / "s0"))

@@ -159,8 +159,8 @@ def test_methods_are_on_the_tracks_that_withhold_nothing_they_are_given(
     assert boards["unposed"] == [("unposed", 1)] and not (done / "board/local.json").exists()
     out = capsys.readouterr().out
     revision = board(done, "leaderboard")["boards"][0]["revision"][:12]
-    assert f"on patterns (release 1, revision {revision})" in out
-    assert f"rank 1 of 1 on unposed (release 1, revision {revision})" in out
+    assert f"on patterns (release 2, revision {revision})" in out
+    assert f"rank 1 of 1 on unposed (release 2, revision {revision})" in out
 
 
 def test_the_boards_are_made_from_the_entries_alone(done: Path) -> None:
@@ -184,7 +184,7 @@ def test_the_archive_is_kept_and_has_no_ranks(done: Path) -> None:
     (done / "board/LEDGER").write_text((done / "board/LEDGER").read_text().replace("local/", "archive/"))
     write_boards(done / "board")
     (only,) = board(done, "archive")["boards"]
-    assert only["why"].startswith("before release 1") and not (done / "board/local.json").exists()
+    assert only["why"].startswith("of an earlier release") and not (done / "board/local.json").exists()
     assert [(r["rank"], r["entries"]) for r in only["rows"]] == [(None, [name])]
 
 

@@ -29,8 +29,8 @@ def test_with_files_an_entry_is_re_scored(
     assert entry["record"] == json.loads((done / "out/results/tfp+4dgs.json").read_text())
     assert entry["verification"]["by"].keys() == {"when", "harness", "environment"}
     revision = board(done, "leaderboard")["boards"][0]["revision"][:12]
-    assert path.parent == done / f"board/entries/1-patterns@{revision}"
-    line = f"tfp+4dgs: re-scored, rank 1 of 1 on patterns (release 1, revision {revision})\n"
+    assert path.parent == done / f"board/entries/2-patterns@{revision}"
+    line = f"tfp+4dgs: re-scored, rank 1 of 1 on patterns (release 2, revision {revision})\n"
     assert capsys.readouterr().out == line
 
 
@@ -45,7 +45,7 @@ def test_another_revision_is_local_says_why_and_leaves_the_track_alone(
     capsys.readouterr()
     assert submit(done / "out/results/tfp+4dgs.json", leaderboard=done / "board", replace=True) == 0
     out = capsys.readouterr().out
-    assert f"pattern-0: revision {'ab' * 6} here, {'cd' * 6} in release 1" in out
+    assert f"pattern-0: revision {'ab' * 6} here, {'cd' * 6} in release 2" in out
     assert f"local board, in {done}/board/local.json, not on a track: local/pattern-0+1@" in out
     assert files_in(done / "board/entries") == public, "the track's entry is as it was"
     (only,) = board(done)["boards"]

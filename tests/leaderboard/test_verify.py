@@ -185,7 +185,7 @@ def test_what_submit_writes_has_no_problems(
     assert not problems(done, capsys)
     assert not problems(done, capsys, **files(done))
     verify_leaderboard(done / "board", **files(done))
-    assert "release 1, 2 entries, 1 scored again, no problems" in capsys.readouterr().out
+    assert "release 2, 2 entries, 1 scored again, no problems" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

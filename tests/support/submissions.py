@@ -16,6 +16,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.submit import submit
 from spike4dgs.leaderboard import tracks
 from spike4dgs.leaderboard.entry import add_line, read_entry, read_ledger
+from spike4dgs.leaderboard.tracks import RELEASE
 
 Record = dict[str, Any]
 
@@ -59,10 +60,13 @@ def board(done: Path, name: str = "local") -> dict[str, Any]:
 
 
 def write_release(folder: Path, all_tracks: Mapping[str, Any], ceilings: Mapping[str, float] | None = None) -> Path:
-    data = {"schema": "spike4dgs-release/1", "release": "1", "tracks": dict(all_tracks), "ceilings_db": ceilings or {}}
-    write_json(folder / "1.json", data)
-    digest = hashlib.sha256((folder / "1.json").read_bytes()).hexdigest()
-    (folder / "SHA256SUMS").write_text(f"{digest}  1.json\n")
+    """Write a release with the number of the current one; `ceilings` are by the scenes' ids."""
+    of = {scene: revision for t in all_tracks.values() for scene, revision in t["scenes"].items()}
+    named = {tracks.scene_name(scene, of[scene]): value for scene, value in (ceilings or {}).items()}
+    data = {"schema": "spike4dgs-release/1", "release": RELEASE, "tracks": dict(all_tracks), "ceilings_db": named}
+    path = folder / f"{RELEASE}.json"
+    write_json(path, data)
+    (folder / "SHA256SUMS").write_text(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n")
     return folder
 
 

@@ -21,7 +21,7 @@ COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 
 
 def test_the_ranking_has_intervals_ties_and_reasons(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["leaderboard", "--track", "outdoor-small", "--leaderboard", str(COMMITTED)]) == 0
+    assert main(["leaderboard", "--track", "ideal", "--leaderboard", str(COMMITTED)]) == 0
     out = capsys.readouterr().out
     lines = [line.split() for line in out.splitlines()]
     (first,) = (line for line in lines if "spike4dgs-x" in line[:2])
@@ -36,7 +36,7 @@ def test_own_runs_stand_beside_and_failures_have_a_reason(
     monkeypatch.chdir(tmp_path)
     assert main(["leaderboard", "--runs", str(finished / "out")]) == 0
     out = capsys.readouterr().out
-    assert "out/tfp+4dgs" in out and "pattern-0 failed" in out and "outdoor-small" in out
+    assert "out/tfp+4dgs" in out and "pattern-0 failed" in out and "ideal" in out
 
 
 def test_an_empty_folder_has_the_published_entries(
@@ -45,7 +45,7 @@ def test_an_empty_folder_has_the_published_entries(
     monkeypatch.chdir(tmp_path)
     assert main(["leaderboard"]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("published entries of release 1") and "41.98" in out
+    assert out.startswith("published entries of release 2") and "41.98" in out
     assert main(["leaderboard", "--track", "objects-small"]) == 2
     assert "a track with entries, found objects-small, which has none yet; choose one of outdoor-small" in (
         capsys.readouterr().err
@@ -66,7 +66,7 @@ def test_a_leaderboard_that_does_not_exist_or_is_empty_is_no_success(
 def test_entries_of_ones_own_stand_among_the_published_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A copy of the published entries without one method, and with another record of a second."""
     own = tmp_path / "own"
-    (folder,) = COMMITTED.glob("entries/1-quick-start@*")
+    (folder,) = COMMITTED.glob("entries/2-quick-start@*")
     shutil.copytree(folder, own / "entries" / folder.name)
     shutil.copy(COMMITTED / "LEDGER", own)
     (own / "entries" / folder.name / "tfi+4dgs.json").unlink()
@@ -101,7 +101,7 @@ def test_a_run_without_its_scenes_gives_a_page_without_images(
 def test_a_row_stays_on_its_lines_whatever_the_width(width: int) -> None:
     """Rows that fit are laid out together; where a cell breaks, what follows it must not move up."""
     boards, _ = gather(SHIPPED, (), brief=True)
-    board = find_board(boards, "outdoor-small")
+    board = find_board(boards, "ideal")
     table = ranking_table(board, "psnr", width)
     console = Console(file=io.StringIO(), width=width, highlight=False)
     console.print(table)

@@ -19,11 +19,11 @@ COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 
 
 def test_cells_are_those_of_the_entry_and_published_values_those_of_the_paper(committed: list[Board]) -> None:
-    found = find_board(committed, "outdoor-small")
-    content = board_content(found, "outdoor-small")
+    found = find_board(committed, "ideal")
+    content = board_content(found, "ideal")
     number = {m["id"]: i for i, m in enumerate(page_metrics())}
     index = next(i for i, r in enumerate(content["rows"]) if r["name"] == "tfp+4dgs")
-    folder = next((COMMITTED / "entries").glob("1-outdoor-small@*"))
+    folder = next((COMMITTED / "entries").glob("2-ideal@*"))
     record = json.loads((folder / "tfp+4dgs.json").read_text())["record"]
     for s, scene in enumerate(content["scenes"]):
         values = content["rows"][index]["cells"][s]["v"]
@@ -49,7 +49,7 @@ def test_a_failed_cell_has_no_value_and_a_reason() -> None:
 
 
 def test_sensors_are_the_releases_or_what_records_state(committed: list[Board]) -> None:
-    public = board_content(find_board(committed, "outdoor-small"), "o")
+    public = board_content(find_board(committed, "ideal"), "o")
     assert [scene["sensor"] for scene in public["scenes"]] == ["noisy"] * 5
     other = board_content(find_board(committed, "car-0-paper"), "c")
     assert [scene["sensor"] for scene in other["scenes"]] == ["not stated"], "an older record, not of the release"

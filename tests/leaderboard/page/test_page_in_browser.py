@@ -134,42 +134,42 @@ def choose(page: Page, name: str, value: str) -> None:
 
 
 def test_it_opens_from_the_disk_and_ranks_as_the_board_does(page: Page) -> None:
-    go(page, "t=outdoor-small")
+    go(page, "t=ideal")
     rows = json.loads((COMMITTED / "leaderboard.json").read_text())["boards"][0]["rows"]
     assert names(page) == [r["method"] for r in rows]
     assert [float(v) for v in column(page, "PSNR, dB")] == [round(r["mean"]["psnr"], 2) for r in rows]
-    assert page.value("document.title") == "outdoor-small: Spike4DGS leaderboard"
+    assert page.value("document.title") == "ideal: Spike4DGS leaderboard"
     assert column(page, "Rank")[0].startswith("= 1–2") and "spike4dgs" in column(page, "Rank")[0]
     assert column(page, "PSNR, paper")[0] == "–", "the paper has no such method"
 
 
 def test_filters_count_what_they_hide_and_live_in_the_address(page: Page) -> None:
-    go(page, "t=outdoor-small")
+    go(page, "t=ideal")
     choose(page, "motion", "hexplane")
-    assert page.value("location.hash") == "#t=outdoor-small&motion=hexplane"
+    assert page.value("location.hash") == "#t=ideal&motion=hexplane"
     assert "5 rows; 8 rows hidden by filters" in page.value("document.getElementById('count').textContent")
     choose(page, "maxfit", "85")
     assert "spike4dgs" not in names(page) and "tfi+4dgs" in names(page)
     page.value("document.querySelector('#count button').click()")
     settle(page)
-    assert page.value("location.hash") == "#t=outdoor-small" and len(names(page)) == 13
+    assert page.value("location.hash") == "#t=ideal" and len(names(page)) == 13
 
 
 def test_the_address_restores_everything(page: Page) -> None:
-    go(page, "t=outdoor-small&m=ssim&s=fit_seconds&d=desc&calibration=given&scenes=car-0-small,van-0-small")
+    go(page, "t=ideal&m=ssim&s=fit_seconds&d=desc&calibration=given&scenes=car-0-small,van-0-small")
     assert page.value("document.querySelector('[name=m]').value") == "ssim"
     assert page.value("document.querySelector('[name=calibration]').value") == "given"
     fits = [float(v) for v in column(page, "fit")]
     assert fits == sorted(fits, reverse=True)
     chosen = "[...document.querySelectorAll('[name=scene]:checked')].map(c => c.value)"
     assert page.value(chosen) == ["car-0-small", "van-0-small"]
-    record = json.loads(next(COMMITTED.glob("entries/1-outdoor-small@*/spike4dgs-x.json")).read_text())["record"]
+    record = json.loads(next(COMMITTED.glob("entries/2-ideal@*/spike4dgs-x.json")).read_text())["record"]
     mean = np.mean([record["scenes"][s]["metrics"]["ssim"] for s in ("car-0-small", "van-0-small")])
     assert column(page, "SSIM")[names(page).index("spike4dgs-x")] == f"{mean:.4f}"
 
 
 def test_headers_sort_and_say_so(page: Page) -> None:
-    go(page, "t=outdoor-small")
+    go(page, "t=ideal")
     header = "[...document.querySelectorAll('#table thead th')].find(h => h.innerText.startsWith('FLIP'))"
     page.value(f"{header}.querySelector('button').click()")
     settle(page)
@@ -198,7 +198,7 @@ def better_of(page: Page, name: str, scenes: list[int]) -> Any:
     return np.array(found)
 
 
-@pytest.mark.parametrize("name", ["outdoor-small", "quick-start", "seeds"])
+@pytest.mark.parametrize("name", ["ideal", "quick-start", "seeds"])
 def test_the_pages_intervals_are_pythons(page: Page, committed: list[Board], name: str) -> None:
     go(page, f"t={name}")
     compared = seeds_board() if name == "seeds" else find_board(committed, name)
@@ -211,11 +211,11 @@ def test_the_pages_intervals_are_pythons(page: Page, committed: list[Board], nam
 
 
 def test_ranks_follow_the_chosen_scenes(page: Page) -> None:
-    go(page, "t=outdoor-small&scenes=car-0-small")
+    go(page, "t=ideal&scenes=car-0-small")
     one = column(page, "Rank")
-    go(page, "t=outdoor-small&iv=fixed")
+    go(page, "t=ideal&iv=fixed")
     fixed = column(page, "Rank")
-    go(page, "t=outdoor-small")
+    go(page, "t=ideal")
     assert fixed != column(page, "Rank") != one and fixed[0].startswith("1,"), "of these five scenes alone it is first"
 
 
@@ -290,19 +290,19 @@ def loaded(page: Page, kind: str) -> Any:
 
 
 def test_a_board_without_images_says_how_to_get_them(page: Page) -> None:
-    go(page, "t=outdoor-small&scene=van-0-small&a=tfp%2B4dgs&b=spike4dgs")
+    go(page, "t=ideal&scene=van-0-small&a=tfp%2B4dgs&b=spike4dgs")
     text = page.value("document.getElementById('scenes').textContent")
     assert "--runs" in text and "tfp+4dgs" in text
     assert page.value("document.querySelectorAll('.curves svg').length") == 1
 
 
 def test_plots_colour_families_and_gray_out_what_is_hidden(page: Page) -> None:
-    go(page, "t=outdoor-small&images=tfp")
+    go(page, "t=ideal&images=tfp")
     plots = page.value("[...document.querySelectorAll('#plots figure svg')].map(s => s.getAttribute('aria-label'))")
     assert plots == [f"PSNR against {c}" for c in ("fit, s", "images/s", "memory, MB", "model, MB")]
     gray = "document.querySelector('#plots figure svg').querySelectorAll('g[fill=\"#999\"] circle').length"
     assert page.value(gray) == 8
-    go(page, "t=outdoor-small&images=tfp&m=psnr_dynamic")
+    go(page, "t=ideal&images=tfp&m=psnr_dynamic")
     assert "18.07" in page.value("document.getElementById('plots').textContent"), (
         "the floor is named, not left out silently"
     )
@@ -317,7 +317,7 @@ def download(page: Page, folder: Path, kind: str) -> str:
 
 def test_downloads_are_what_is_shown(page: Page, tmp_path: Path) -> None:
     page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-    go(page, "t=outdoor-small&m=psnr_dynamic&motion=spacetime")
+    go(page, "t=ideal&m=psnr_dynamic&motion=spacetime")
     lines = [line.split(",") for line in download(page, tmp_path, "csv").splitlines()]
     assert [line[lines[0].index("method")] for line in lines[1:]] == names(page)
     value = float(lines[1][lines[0].index("psnr_dynamic")])
@@ -347,20 +347,18 @@ def test_nothing_that_an_entry_holds_runs(page: Page, tmp_path: Path) -> None:
 
 
 def test_details_have_command_hashes_and_commit(page: Page) -> None:
-    go(page, "t=outdoor-small&row=tfp%2B4dgs")
+    go(page, "t=ideal&row=tfp%2B4dgs")
     wait_for("details", lambda: page.value("document.getElementById('details').open"))
     text = page.value("document.getElementById('details').textContent")
-    entry = json.loads(next(COMMITTED.glob("entries/1-outdoor-small@*/tfp+4dgs.json")).read_text())["record"]
+    entry = json.loads(next(COMMITTED.glob("entries/2-ideal@*/tfp+4dgs.json")).read_text())["record"]
     assert entry["command"] in text and entry["harness"]["commit"] in text and entry["environment"]["cpu"] in text
     assert all(cell["predictions_sha256"] in text for cell in entry["scenes"].values())
-    go(page, "t=outdoor-small")
+    go(page, "t=ideal")
     assert not page.value("document.getElementById('details').open")
 
 
 def test_questions_are_answered_in_one_click(page: Page) -> None:
-    record = {
-        path.stem: json.loads(path.read_text())["record"] for path in COMMITTED.glob("entries/1-outdoor-small@*/*.json")
-    }
+    record = {path.stem: json.loads(path.read_text())["record"] for path in COMMITTED.glob("entries/2-ideal@*/*.json")}
     fit = {name: np.mean([c["fit_seconds"] for c in r["scenes"].values()]) for name, r in record.items()}
     quick = sorted((n for n in fit if fit[n] <= 60), key=lambda n: -record[n]["mean"]["psnr_dynamic"])
     uncalibrated = [n for n in quick if "flat-field" not in record[n]["method"].get("given", ["flat-field"])]
@@ -384,7 +382,7 @@ def test_the_sensor_filters_scenes_and_hides_all_rows_where_no_scene_has_it(page
     assert column(page, "PSNR, dB") == ["25.00", "20.00"] and names(page) == ["other", "clean"]
     choose(page, "sensor", "")
     assert column(page, "PSNR, dB") == ["30.00", "27.50"]
-    go(page, "t=outdoor-small&sensor=recorded")
+    go(page, "t=ideal&sensor=recorded")
     assert names(page) == [] and "13 rows hidden" in page.value("document.getElementById('count').textContent")
     page.value("document.querySelector('#count button').click()")
     settle(page)
@@ -429,7 +427,7 @@ def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
     labels = "e.getAttribute('aria-label') || e.getAttribute('aria-labelledby')"
     what = "input, select, button, [role=img], dialog, nav, section"
     unnamed = f"[...document.querySelectorAll('{what}')].filter(e => !({said} || {labels})).map(e => e.outerHTML)"
-    for state in ("t=pattern-0%2B1", "t=outdoor-small"):  # with images and without
+    for state in ("t=pattern-0%2B1", "t=ideal"):  # with images and without
         go(page, state)
         assert page.value(unnamed) == []
     page.value("document.getElementById('skip').focus()")
@@ -468,7 +466,7 @@ def test_a_thousand_rows_of_45_scenes_filter_at_once(
 
 
 def test_a_screen_in_the_dark(page: Page) -> None:
-    go(page, "t=outdoor-small")
+    go(page, "t=ideal")
     page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
     page.value("scrollTo(0, 0)")
     dark = page.screenshot()

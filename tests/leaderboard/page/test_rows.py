@@ -49,5 +49,5 @@ def test_a_folder_without_records_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_unknown_track_is_refused(committed: list[Board]) -> None:
-    with pytest.raises(UserError, match="outdoor-small"):
+    with pytest.raises(UserError, match="ideal"):
         find_board(committed, "indoor")

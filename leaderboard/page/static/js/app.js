@@ -102,7 +102,7 @@ Spike4DGS.app = (() => {
 
   function submitting() {
     const lines = [
-      "spike4dgs run-benchmark --track outdoor-small --methods NAME --out runs/mine",
+      "spike4dgs run-benchmark --track ideal --methods NAME --out runs/mine",
       "spike4dgs leaderboard --runs runs/mine   # your row among these",
       "spike4dgs submit runs/mine/results/NAME.json --predictions runs/mine/predictions/NAME --scenes data/*-small"];
     return el("details", { id: "submit" }, el("summary", {}, "Submit a result"),
