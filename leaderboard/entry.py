@@ -4,6 +4,7 @@
     LEADERBOARD/entries/RELEASE-TRACK@REVISION/METHOD@seed-K.json   another seed than 0
     LEADERBOARD/local/SCENE+N@REVISION/METHOD.json                  of any other scenes, revisions or split
     LEADERBOARD/archive/SCENE+N@REVISION/METHOD.json                of an earlier release
+    .../METHOD.webp                                                 a sheet of images beside it (`thumbnails`)
 
 REVISION begins the hash of the scenes' revisions and the split (`tracks.dataset_revision`). Paths follow from the
 record's scenes, revisions, split, method and seed alone. Hidden files are no entries: a killed process may leave some.
@@ -26,9 +27,19 @@ from typing import Any
 
 from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import json_object, locked, read_bytes, read_json, sha256_json, write_json, write_text
+from spike4dgs.benchmark.files import (
+    json_object,
+    locked,
+    read_bytes,
+    read_json,
+    sha256_json,
+    write_bytes,
+    write_json,
+    write_text,
+)
 from spike4dgs.benchmark.runs.record import Record, check_form, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.leaderboard.thumbnails import KEY, Thumbnails, has_sheet, sheet_path, sheets
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, SHIPPED, place_of
 
 SCHEMA = "spike4dgs-entry/2"
@@ -205,12 +216,18 @@ def typical_fit_seconds() -> dict[str, float]:
     return {method: sum(known) / len(known) for method, known in times.items() if known}
 
 
-def write_entry(leaderboard: Path, record: Record, verification: Mapping[str, Any], replace: bool) -> Entry:
+def write_entry(
+    leaderboard: Path,
+    record: Record,
+    verification: Mapping[str, Any],
+    replace: bool,
+    thumbnails: Thumbnails | None = None,
+) -> Entry:
     """Write a record's entry, or keep the one that makes the same claim; return the entry in the leaderboard.
 
-    An entry that makes the same claim takes over a better verification. The caller holds the leaderboard's lock. Raises
-    UserError where the method has another record there, unless `replace`, and where another method's name differs by
-    case alone.
+    An entry that makes the same claim takes over a better verification, and thumbnails if its own are missing. The
+    caller holds the leaderboard's lock. Raises UserError where the method has another record there, unless `replace`,
+    and where another method's name differs by case alone.
     """
     name = entry_path(record)
     path = leaderboard / name
@@ -228,15 +245,25 @@ def write_entry(leaderboard: Path, record: Record, verification: Mapping[str, An
                 raise
         else:
             if _claim(old["record"]) == _claim(record):
-                if _confidence(entry) <= _confidence(old):
+                better = _confidence(entry) > _confidence(old)
+                if has_sheet(path, old):
+                    thumbnails = None
+                if not better and thumbnails is None:
                     return old
-                entry = {**old, "verification": dict(verification)}
+                entry = {**old, "verification": dict(verification)} if better else old
             elif not replace:
                 fix = "pass --replace to put the new record in its place"
                 raise problem(path, "no entry of this method, or the same record", "another record", fix)
-    # First the ledger: a process that is killed in between leaves a line too many, never an entry without one.
+    if thumbnails:
+        entry = {**entry, KEY: thumbnails.stated}
+    # First the ledger and the sheet: a process that is killed in between leaves a line or a sheet too many, never an
+    # entry without one.
     add_line(leaderboard, sha256_json(entry), name)
+    if thumbnails:
+        write_bytes(sheet_path(path), thumbnails.sheet)
     write_json(path, entry)
+    if KEY not in entry:
+        sheet_path(path).unlink(missing_ok=True)
     return entry
 
 
@@ -247,10 +274,16 @@ def lock(leaderboard: Path) -> Any:
 
 
 def remove_parts(leaderboard: Path) -> None:
-    """Remove what killed processes left half written. The caller holds the leaderboard's lock."""
+    """Remove what killed processes left half written, and sheets without an entry.
+
+    The caller holds the leaderboard's lock.
+    """
     for pattern in (".*.part*", *(f"{folder}/*/.*.part*" for folder in FOLDERS)):
         for part in leaderboard.glob(pattern):
             part.unlink(missing_ok=True)
+    for sheet in sheets(leaderboard, *FOLDERS):
+        if not sheet.with_suffix(".json").is_file():
+            sheet.unlink(missing_ok=True)
 
 
 def _confidence(entry: Entry) -> tuple[int, int, int]:

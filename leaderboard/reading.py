@@ -31,6 +31,7 @@ from spike4dgs.leaderboard.entry import (
     parse_entry,
     read_ledger,
 )
+from spike4dgs.leaderboard.thumbnails import KEY
 
 FEWEST = 10  # entries of a leaderboard whose checks are kept: fewer are checked in less than a tenth of a second
 _HEAVY = {  # what boards do not need
@@ -126,7 +127,7 @@ def _brief(entry: Entry) -> Entry:
         }
         for scene, cell in record["scenes"].items()
     }
-    return {**entry, "record": {**record, "scenes": scenes}}
+    return {**{k: v for k, v in entry.items() if k != KEY}, "record": {**record, "scenes": scenes}}
 
 
 def _file(leaderboard: Path) -> Path:

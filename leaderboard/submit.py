@@ -36,6 +36,7 @@ from spike4dgs.leaderboard.entry import (
     write_entry,
 )
 from spike4dgs.leaderboard.rank import FILES, standing, write_boards
+from spike4dgs.leaderboard.thumbnails import Thumbnails, make_thumbnails
 from spike4dgs.leaderboard.tracks import LOCAL, place_of, with_equivalents
 from spike4dgs.leaderboard.truth_check import SecondRenderings, no_renderings
 from spike4dgs.leaderboard.verify import TOLERANCE_DB, verify_record
@@ -138,11 +139,12 @@ class Files:
 
 @dataclass(frozen=True)
 class Verified:
-    """A record, what was verified of it, and why nothing was (an empty text otherwise)."""
+    """A record, what was verified of it, why nothing was (an empty text otherwise), and thumbnails if it was."""
 
     record: Record
     verification: Mapping[str, Any]
     missing: str
+    thumbnails: Thumbnails | None = None
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,7 @@ def _verify(result: Path, files: Files, leaderboard: Path) -> Verified:
         "truth": {scene: asdict(check) for scene, check in rescored.truth.items()},
         "refit": asdict(refit) if refit else None,
     }
-    return Verified(record, verification, "")
+    return Verified(record, verification, "", make_thumbnails(record, files.predictions, opened))
 
 
 def _enter(verified: Sequence[Verified], leaderboard: Path, replace: bool, refused: list[str] | None) -> Submitted:
@@ -218,7 +220,8 @@ def _enter(verified: Sequence[Verified], leaderboard: Path, replace: bool, refus
         remove_parts(leaderboard)
         for one in verified:
             try:
-                entered.append((one, write_entry(leaderboard, one.record, one.verification, replace)))
+                entry = write_entry(leaderboard, one.record, one.verification, replace, one.thumbnails)
+                entered.append((one, entry))
             except UserError as e:
                 if refused is None:
                     raise

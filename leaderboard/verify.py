@@ -24,7 +24,8 @@ from spike4dgs.benchmark.runs.score import open_for, prediction_folders, score_s
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.leaderboard.entry import CLAIMED, FOLDERS, RE_FITTED, Entry, check_folder
 from spike4dgs.leaderboard.rank import FILES, flags_of, make_boards
-from spike4dgs.leaderboard.reading import read_all
+from spike4dgs.leaderboard.reading import Reading, read_all
+from spike4dgs.leaderboard.thumbnails import KEY, read_sheet, sheet_path, sheets
 from spike4dgs.leaderboard.tracks import match_release
 from spike4dgs.leaderboard.truth_check import Renderings, SecondRenderings, TruthCheck, check_truth, no_renderings
 
@@ -153,7 +154,7 @@ def verify_leaderboard(
     second_renderings: SecondRenderings = no_renderings,
     fit_again: FitAgain | None = None,
 ) -> Findings:
-    """Check that entries are as submitted and that boards follow from them.
+    """Check that entries and their sheets are as submitted, and that boards follow from them.
 
     `predictions` METHOD/SCENE of a run are scored again, with those of `scenes` that are there, and what the entry says
     of that verification is compared with what comes out; with `fit_again` those that are labelled re-fitted are fitted
@@ -163,7 +164,7 @@ def verify_leaderboard(
     reading = read_all(leaderboard, *FOLDERS)
     entries = reading.entries
     problems = [f"{leaderboard / path}: {reason}" for path, reason in reading.refused.items()]
-    problems += _stale_boards(leaderboard, make_boards(reading))
+    problems += [*_stale_boards(leaderboard, make_boards(reading)), *_wrong_sheets(leaderboard, reading)]
     scored = not_fitted = 0
     if predictions is not None:
         by_id = {open_scenes([scene], allow_gaps)[0].id: scene for scene in scenes}
@@ -196,6 +197,20 @@ def _stale_boards(leaderboard: Path, boards: Mapping[str, Any]) -> Iterator[str]
             continue
         if found != boards[folder]:
             yield f"{path}: expected what the entries give, found other content; submit any record again"
+
+
+def _wrong_sheets(leaderboard: Path, reading: Reading) -> Iterator[str]:
+    """Yield a line for each sheet that is not as its entry states, and for each that no entry states."""
+    stating = {path: entry[KEY] for path, entry in reading.entries.items() if KEY in entry}
+    for path, stated in stating.items():
+        try:
+            read_sheet(sheet_path(leaderboard / path), stated)
+        except UserError as e:
+            yield str(e)
+    known = {sheet_path(leaderboard / path) for path in stating.keys() | reading.refused.keys()}
+    for sheet in sheets(leaderboard, *FOLDERS):
+        if sheet not in known:
+            yield f"{sheet}: expected no such file, as no entry states it; remove it"
 
 
 def _scenes_of(entry: Entry, predictions: Path, scenes: Mapping[str, Path], allow_gaps: bool) -> list[Scene]:

@@ -32,7 +32,7 @@ ORDER = {
     "schedule models checkpoint msdi images matching starts self_calibration trainer tuned fit recipes viewing "
     "recordings",
     "baselines": "nearest_view images radiance_field spike_render exposure starts tracking spacetime recipes",
-    "leaderboard": "tracks entry reading truth_check rank verify submit page season",
+    "leaderboard": "tracks thumbnails entry reading truth_check rank verify submit page season",
     "studies": "kit hard_cases speed_error gpu_receipt images recorder_runs recorder saved_models modality "
     "oracle_truth oracle_methods oracle_ladder faults patterns poses realism spike_agreement scene_noise "
     "second_renderer tuning results",

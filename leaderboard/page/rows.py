@@ -13,6 +13,7 @@ from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
 from spike4dgs.leaderboard.entry import Entry
 from spike4dgs.leaderboard.rank import make_boards, reason
 from spike4dgs.leaderboard.reading import Reading, read_briefs, read_checked
+from spike4dgs.leaderboard.thumbnails import KEY, sheet_path
 from spike4dgs.leaderboard.tracks import (
     ARCHIVE,
     LOCAL,
@@ -34,7 +35,7 @@ class Row:
     """A method on a board: the records of its seeds, and what is known of them.
 
     `why` is the reason where the row is not `ranked`. `predictions` has the folders of a run that holds the images of
-    the first seed, by scene.
+    the first seed, by scene; `sheet` is where that of the first seed's entry lies.
     """
 
     name: str
@@ -46,6 +47,13 @@ class Row:
     hashes: Mapping[str, str] = field(default_factory=dict)  # of the entries' files, as in the ledger
     run: Path | None = None
     predictions: dict[str, Path] = field(default_factory=dict)
+    sheet: Path | None = None
+
+    @property
+    def thumbnails(self) -> Mapping[str, Any]:
+        """What the first seed's entry states of its sheet; empty where it states none."""
+        stated: Mapping[str, Any] = next(iter(self.entries.values()), {}).get(KEY, {})
+        return stated
 
     @property
     def first(self) -> Record:
@@ -95,7 +103,7 @@ def gather(
     reading = read_briefs(leaderboard) if brief else read_checked(leaderboard)
     for folder, file in make_boards(reading).items():
         refused += file["refused"]
-        boards += [_board(folder, board, reading) for board in file["boards"]]
+        boards += [_board(leaderboard, folder, board, reading) for board in file["boards"]]
     if published and leaderboard.resolve() != SHIPPED.resolve():
         _add_published(boards, brief)
     for run in runs:
@@ -114,7 +122,7 @@ def run_records(run: Path) -> list[Record]:
     return [read_record(path) for path in paths]
 
 
-def _board(folder: str, board: Mapping[str, Any], reading: Reading) -> Board:
+def _board(leaderboard: Path, folder: str, board: Mapping[str, Any], reading: Reading) -> Board:
     rows = []
     for row in board["rows"]:
         own = {path: reading.entries[path] for path in row["entries"]}
@@ -122,7 +130,8 @@ def _board(folder: str, board: Mapping[str, Any], reading: Reading) -> Board:
         name = Path(row["entries"][0]).stem if len(own) == 1 else row["method"]
         records = tuple(e["record"] for e in own.values())
         hashes = {path: reading.hashes[path] for path in own}
-        rows.append(Row(name, row["label"], row["rank"] is not None, why, records, own, hashes))
+        sheet = sheet_path(leaderboard / row["entries"][0])
+        rows.append(Row(name, row["label"], row["rank"] is not None, why, records, own, hashes, sheet=sheet))
     name, title = (board["track"], board["title"]) if board["track"] else (board["title"], in_words(board["dataset"]))
     return Board(name, title, folder, board["why"], tuple(board["withheld"]), board["dataset"], rows)
 

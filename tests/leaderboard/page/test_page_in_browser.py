@@ -17,12 +17,13 @@ from devtools import Page, wait_for
 from page_boards import board, cell, failed, large_board, row
 
 from spike4dgs.benchmark.reports.error_map import error_image
-from spike4dgs.benchmark.scene.images import read_exr
+from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard.page.intervals import compare
 from spike4dgs.leaderboard.page.rows import Board, find_board, gather
 from spike4dgs.leaderboard.page.scores import image_scores
 from spike4dgs.leaderboard.page.site import write_site
+from spike4dgs.leaderboard.submit import submit_all
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 HOSTILE = '<img src=x onerror="window.hacked=1"></script><script>window.hacked=1</script>'
@@ -79,6 +80,15 @@ def seeds_board() -> Board:
     return board("seeds", [replace(many[0], records=tuple(m.first for m in many)), records("one", 30.4)])
 
 
+def sheets_board(finished: Path, folder: Path) -> Board:
+    """The entries of a run, which have thumbnails, without the run."""
+    names = ("tfp+4dgs", "rough")
+    results = {finished / f"out/results/{name}.json": finished / "out/predictions" / name for name in names}
+    submit_all(results, scenes=(finished / "s0", finished / "s1"), leaderboard=folder)
+    ((board,), _) = gather(folder, ())
+    return replace(board, name="sheets")
+
+
 @pytest.fixture(scope="module")
 def shown(one_browser: Page) -> Iterator[Page]:
     one_browser.forget()
@@ -91,7 +101,8 @@ def folder(finished: Path, data: Path, tmp_path_factory: pytest.TempPathFactory)
     """The committed entries, a run with images, and boards made for the tests, as one page."""
     out = tmp_path_factory.mktemp("page") / "page"
     boards, refused = gather(COMMITTED, (finished / "out",))
-    made = [seeds_board(), sensors_board(), hostile_board()]
+    sheets = sheets_board(finished, tmp_path_factory.mktemp("sheets") / "board")
+    made = [seeds_board(), sensors_board(), hostile_board(), sheets]
     write_site(out, [*boards, *made], [*refused, {"entry": HOSTILE, "reason": HOSTILE}], data)
     return out
 
@@ -289,10 +300,37 @@ def loaded(page: Page, kind: str) -> Any:
     return page.value(f"(() => {{ const c = {of}; return Spike4DGS.ready(`{kind}-${{n}}`) }})()")
 
 
-def test_a_board_without_images_says_how_to_get_them(page: Page) -> None:
-    go(page, "t=ideal&scene=van-0-small&a=tfp%2B4dgs&b=spike4dgs")
+def test_entries_with_sheets_show_an_image_without_runs(page: Page, data: Path, finished: Path) -> None:
+    """One image of each kind, the same as in the files but for the losses of the sheet; a row of it for each scene."""
+    own = "t=sheets&a=rough&b=tfp%2B4dgs&split=100&e=30"
+    for scene_id in ("pattern-0", "pattern-1"):
+        go(page, f"{own}&scene={scene_id}")
+        scene = open_scene(data / scene_id)
+        truth = scene.ground_truth(scene.targets[1])
+        rendered = read_exr(finished / f"out/predictions/rough/{scene_id}/{scene.targets[1].name}.exr")
+        errors = cv2.cvtColor(error_image(rendered, truth, 0.01), cv2.COLOR_RGB2GRAY)
+        expected = {"truth": encode_srgb(truth), "images": encode_srgb(rendered), "errors": errors}
+        for pane, of in expected.items():
+            seen = image(page, f"pane-{pane}")
+            small = cv2.resize(seen, of.shape[::-1], interpolation=cv2.INTER_AREA)[:, :-1]  # without the slider's bar
+            assert np.abs(small - of[:, :-1]).mean() < (25 if pane == "errors" else 4)
+            assert np.corrcoef(small.ravel(), of[:, :-1].ravel())[0, 1] > 0.8
     text = page.value("document.getElementById('scenes').textContent")
-    assert "--runs" in text and "tfp+4dgs" in text
+    assert "cam_03/000040" in text and "as it comes with the entries" in text and "--runs" in text
+    assert page.value("document.querySelectorAll('[name=split]').length") == 1
+    assert page.value("document.querySelectorAll('[name=k]').length") == 0, "one image has no time to choose"
+    first = image(page, "pane-images")
+    go(page, f"{own.replace('split=100', 'split=0')}&scene=pattern-1")
+    assert np.abs(image(page, "pane-images") - first).mean() > 0.3, "the other method"
+    go(page, f"{own}&scene=pattern-1&crop=1")
+    shape = image(page, "pane-truth").shape
+    assert shape[0] / shape[1] == pytest.approx(24 / 24, abs=0.05), "a crop of 24x24 of 40x24 pixels"
+
+
+def test_a_board_without_images_says_how_to_get_them(page: Page) -> None:
+    go(page, "t=sensors&scene=i&a=clean&b=other")
+    text = page.value("document.getElementById('scenes').textContent")
+    assert "No images here" in text and "--runs" in text and "clean" in text
     assert page.value("document.querySelectorAll('.curves svg').length") == 1
 
 
@@ -427,7 +465,7 @@ def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
     labels = "e.getAttribute('aria-label') || e.getAttribute('aria-labelledby')"
     what = "input, select, button, [role=img], dialog, nav, section"
     unnamed = f"[...document.querySelectorAll('{what}')].filter(e => !({said} || {labels})).map(e => e.outerHTML)"
-    for state in ("t=pattern-0%2B1", "t=ideal"):  # with images and without
+    for state in ("t=pattern-0%2B1", "t=sheets", "t=sensors"):  # with images, with thumbnails, and without
         go(page, state)
         assert page.value(unnamed) == []
     page.value("document.getElementById('skip').focus()")

@@ -128,6 +128,7 @@ Spike4DGS.app = (() => {
     page.index = new Map(page.metrics.map((metric, number) => [metric.id, { ...metric, number }]));
     page.published = (board) => board.published;
     page.hint = "No images here: build the page with --runs and --data to see truth and methods side by side.";
+    page.one = "One image, as it comes with the entries, compressed. Build the page with --runs and --data to see all.";
     links();
     Spike4DGS.controls.questions(page, link);
     byId("controls").addEventListener("submit", (e) => e.preventDefault());

@@ -1,5 +1,6 @@
 "use strict";
-/* One scene: truth and two methods under a slider, error maps, a time scrubber, a crop of what moves, curves. */
+/* One scene: truth and two methods under a slider, error maps, a time scrubber, a crop of what moves, curves.
+   The images are those of runs, or of one target, from the entries' sheets. */
 Spike4DGS.compare = (() => {
   const { el, byId, fill, format, heading } = Spike4DGS.dom;
   const COLORS = ["#4269d0", "#d97a00"];
@@ -39,6 +40,7 @@ Spike4DGS.compare = (() => {
           onchange: (e) => change({ crop: e.target.checked }) }), "Crop what moves")),
       sceneFacts(board.scenes[s]),
       picture ? panes(context, text, figure) : el("p", { class: "small" }, page.hint),
+      picture?.sheets && el("p", { class: "small" }, page.one),
       text, figure);
     update(context, k, text, figure);
     byId("scenes").querySelector(`[name="${focused}"]`)?.focus();
@@ -113,7 +115,7 @@ Spike4DGS.compare = (() => {
         el("label", {}, el("span", {}, `Slider: ${nameA} on the left, ${nameB} on the right`),
           el("input", { type: "range", name: "split", min: "0", max: "100", value: String(split),
             oninput: (e) => place(node, Number(e.target.value)), onchange: (e) => change({ split: Number(e.target.value) }, true) })),
-        el("label", {}, el("span", {}, "Time: ", el("output", { id: "at" })),
+        names.length > 1 && el("label", {}, el("span", {}, "Time: ", el("output", { id: "at" })),
           el("input", { type: "range", name: "k", "aria-label": "Time", min: "0", max: String(names.length - 1), value: String(k),
             oninput: (e) => update(context, Number(e.target.value), text, figure),
             onchange: (e) => change({ k: Number(e.target.value) }, true) }))),
@@ -136,7 +138,7 @@ Spike4DGS.compare = (() => {
     const { page, view, board, s, a, b, names, picture, scores, state } = context;
     const metric = page.index.get(view.metric);
     if (picture) show(picture, state.crop ? picture.crops[k] : null, a, b, k);
-    const at = picture ? `${picture.ms[k].toFixed(2)} ms` : names[k];
+    const at = picture?.ms ? `${picture.ms[k].toFixed(2)} ms` : names[k];
     if (byId("at")) byId("at").textContent = `${at} (image ${k + 1} of ${names.length})`;
     const image = scores.images[s].indexOf(names[k]);
     const one = (row) => {
@@ -155,27 +157,32 @@ Spike4DGS.compare = (() => {
     return [swatch, el("strong", {}, row.name)];
   }
 
-  function show(picture, crop, a, b, k) {
-    const path = (row, kind) => `${picture.folder}/${row}/${k}${kind}.webp`;
-    const put = (pane, below, over) => {
-      const [first, second] = byId(pane).querySelectorAll("img");
-      first.src = below;
-      if (second) second.src = over;
-      frame(byId(pane).querySelector(".frame"), picture, crop);
-    };
-    put("pane-truth", path("truth", ""));
-    put("pane-images", path(b, ""), path(a, ""));
-    put("pane-errors", path(b, "-error"), path(a, "-error"));
+  const KINDS = ["truth", "render", "error"]; // in the order of a sheet's columns
+
+  /* Return where an image lies: a file, its size, and the image's corner in it. */
+  function source({ folder, sheets, width, height }, kind, row, k) {
+    if (sheets) return { ...sheets[row], left: KINDS.indexOf(kind) * width };
+    const name = kind === "truth" ? `truth/${k}` : `${row}/${k}${kind === "error" ? "-error" : ""}`;
+    return { file: `${folder}/${name}.webp`, width, height, left: 0, top: 0 };
   }
 
-  /* Scale the images so that the crop, or all, fills the frame. The slider cuts the frame, not the images. */
-  function frame(node, picture, crop) {
+  function show(picture, crop, a, b, k) {
+    const put = (pane, kind, ...rows) => {
+      const images = byId(pane).querySelectorAll("img");
+      rows.forEach((row, i) => fit(images[i], picture, source(picture, kind, row, k), crop));
+    };
+    put("pane-truth", "truth", a);
+    put("pane-images", "render", b, a);
+    put("pane-errors", "error", b, a);
+  }
+
+  /* Scale an image so that the crop, or all, fills its frame. The slider cuts the frame, not the images. */
+  function fit(img, picture, { file, left, top, width, height }, crop) {
     const [x, y, w, h] = crop ?? [0, 0, picture.width, picture.height];
-    node.style.aspectRatio = `${w} / ${h}`;
-    const percent = { left: -x / w, top: -y / h, width: picture.width / w, height: picture.height / h };
-    for (const img of node.querySelectorAll("img")) {
-      for (const [key, value] of Object.entries(percent)) img.style[key] = `${100 * value}%`;
-    }
+    img.closest(".frame").style.aspectRatio = `${w} / ${h}`;
+    img.src = file;
+    const percent = { left: -(left + x) / w, top: -(top + y) / h, width: width / w, height: height / h };
+    for (const [key, value] of Object.entries(percent)) img.style[key] = `${100 * value}%`;
   }
 
   return { draw };

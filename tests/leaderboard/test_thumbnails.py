@@ -1,0 +1,201 @@
+"""The sheets beside entries: they show what was scored, belong to their entries, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from changes import edit_json, files_in
+from dummy_methods import CountMethod, run
+from PIL import Image
+from submissions import edit_with_ledger, enter, read
+
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.reports.error_map import SCALES
+from spike4dgs.benchmark.reports.panels import Box
+from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_mask
+from spike4dgs.cli import main
+from spike4dgs.leaderboard import entry, thumbnails
+from spike4dgs.leaderboard.thumbnails import read_sheet, sheet_path
+
+MIDDLE, WIDTH, HEIGHT = "cam_03/000040", 40, 24
+
+
+def pixels(sheet: Path) -> np.ndarray:
+    return np.asarray(Image.open(sheet).convert("L")).astype(float)
+
+
+def problems(done: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """What `verify-leaderboard` finds."""
+    capsys.readouterr()
+    code = main(["verify-leaderboard", str(done / "board")])
+    lines = capsys.readouterr().err.splitlines()
+    assert code == bool(lines)
+    return lines
+
+
+def test_the_sheet_shows_what_was_scored_and_the_entry_states_it(done: Path) -> None:
+    path = enter(done, "rough")
+    stated = read(path)["thumbnails"]
+    assert stated["sha256"] == hashlib.sha256(sheet_path(path).read_bytes()).hexdigest()
+    assert stated["scenes"].keys() == {"pattern-0", "pattern-1"}
+    sheet = pixels(sheet_path(path))
+    assert sheet.shape == (2 * HEIGHT, 3 * WIDTH)
+    for s in range(2):
+        truth = read_exr(done / f"s{s}/images/{MIDDLE}.exr")
+        image = read_exr(done / f"out/predictions/rough/pattern-{s}/{MIDDLE}.exr")
+        levels = 255 * np.sqrt(np.abs(image.clip(0, 1) - truth.clip(0, 1)).clip(max=0.3) / 0.3)
+        row = np.split(sheet[s * HEIGHT : (s + 1) * HEIGHT], 3, axis=1)
+        for found, expected, loss in zip(row, (encode_srgb(truth), encode_srgb(image), levels), (3, 3, 9), strict=True):
+            assert np.abs(found - expected).mean() < loss and np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.95
+        own = stated["scenes"][f"pattern-{s}"]
+        assert (own["target"], own["width"], own["height"]) == (MIDDLE, WIDTH, HEIGHT) and own["scale"] in SCALES
+        assert Box(*own["crop"]).of(read_mask(done / f"s{s}/masks/{MIDDLE}.png")).sum() == HEIGHT * 15, "all that moves"
+
+
+def test_equal_inputs_give_equal_bytes(done: Path) -> None:
+    first = sheet_path(enter(done)).read_bytes()
+    (done / "board").rename(done / "earlier")
+    assert sheet_path(enter(done)).read_bytes() == first
+
+
+def test_large_images_are_made_small_with_their_crops(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = read(enter(done))["thumbnails"]["scenes"]["pattern-0"]
+    (done / "board").rename(done / "earlier")
+    monkeypatch.setattr(thumbnails, "LARGEST", 10)
+    path = enter(done)
+    own = read(path)["thumbnails"]["scenes"]["pattern-0"]
+    assert (own["width"], own["height"]) == (10, 6) and own["scale"] == whole["scale"]
+    np.testing.assert_allclose(own["crop"], np.array(whole["crop"]) / 4, atol=1)
+    truth = encode_srgb(read_exr(done / f"s0/images/{MIDDLE}.exr")).astype(float)
+    means = truth.reshape(6, 4, 10, 4).mean(axis=(1, 3))
+    assert np.abs(pixels(sheet_path(path))[:6, :10] - means).mean() < 6
+
+
+def test_a_claim_has_no_sheet(done: Path) -> None:
+    path = enter(done, verified=False)
+    assert "thumbnails" not in read(path) and not sheet_path(path).exists()
+    enter(done)
+    assert read(path)["thumbnails"]["sha256"] == hashlib.sha256(sheet_path(path).read_bytes()).hexdigest()
+
+
+def test_a_claim_that_states_a_sheet_is_refused(done: Path) -> None:
+    stated = read(enter(done))["thumbnails"]
+    path = enter(done, "rough", verified=False)
+    edit_with_ledger(path, lambda e: e.update(thumbnails=stated))
+    with pytest.raises(UserError, match="at verification/label"):
+        read(path)
+
+
+def test_another_record_has_another_sheet_or_none(done: Path) -> None:
+    path = enter(done)
+    first = sheet_path(path).read_bytes()
+    run(done / "out", [done / "s0", done / "s1"], CountMethod("tfp+4dgs", steps=1))
+    enter(done, replace=True)
+    second = sheet_path(path).read_bytes()
+    assert second != first and read_sheet(sheet_path(path), read(path)["thumbnails"]) == second
+    run(done / "out", [done / "s0", done / "s1"], CountMethod("tfp+4dgs", steps=2))
+    enter(done, verified=False, replace=True)
+    assert not sheet_path(path).exists()
+
+
+def test_the_sheet_of_a_removed_entry_is_found_and_the_next_submission_removes_it(
+    done: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = enter(done)
+    enter(done, "rough")
+    assert problems(done, capsys) == []
+    path.unlink()
+    assert f"error: {sheet_path(path)}: expected no such file, as no entry states it; remove it" in problems(
+        done, capsys
+    )
+    enter(done, "rough")
+    assert not sheet_path(path).exists() and problems(done, capsys) == []
+
+
+def test_an_entry_without_its_sheet_gets_it_again_and_keeps_all_else(
+    done: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without any, as entries were before sheets, and with one that is not there."""
+    path = enter(done)
+    before = files_in(done / "board")
+    sheet_path(path).unlink()
+    (line,) = problems(done, capsys)
+    assert f"{sheet_path(path)}: expected the thumbnails that its entry states, found no such file" in line
+    enter(done, verified=False)
+    assert not sheet_path(path).exists()
+    enter(done)
+    assert files_in(done / "board") == before
+    sheet_path(path).unlink()
+    edit_with_ledger(path, lambda e: e.pop("thumbnails"))
+    enter(done)
+    assert path.read_bytes() == before[path.relative_to(done / "board").as_posix()] and problems(done, capsys) == []
+
+
+def test_a_killed_submission_leaves_a_sheet_that_blocks_nobody(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as kill:
+        kill.setattr(entry, "write_json", killed)
+        with pytest.raises(KeyboardInterrupt):
+            enter(done)
+    assert [p.suffix for p in (done / "board").rglob("tfp+4dgs.*")] == [".webp"]
+    enter(done, "rough")
+    assert not list((done / "board").rglob("tfp+4dgs.*")), "the next submission begins anew"
+    path = enter(done)
+    assert read_sheet(sheet_path(path), read(path)["thumbnails"])
+
+
+def test_an_exchanged_sheet_is_found(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, other = enter(done), enter(done, "rough")
+    sheet_path(path).write_bytes(sheet_path(other).read_bytes())
+    (line,) = problems(done, capsys)
+    assert line.startswith(
+        f"error: {sheet_path(path)}: expected sha256 {read(path)['thumbnails']['sha256'][:16]}... as"
+    )
+
+
+def lossy(width: int, height: int) -> bytes:
+    """The first bytes of a lossy WebP image that says it has that size."""
+    return b"RIFF\0\0\0\0WEBPVP8 \0\0\0\0\0\0\0\x9d\x01\x2a" + struct.pack("<HH", width, height) + b"\0" * 64
+
+
+def png() -> bytes:
+    out = io.BytesIO()
+    Image.new("L", (120, 48)).save(out, "PNG")
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [(lossy(16383, 16383), "16383x16383"), (lossy(120, 49), "120x49"), (png(), "another file"), (b"", "another file")],
+)
+def test_an_image_of_another_size_or_kind_is_no_sheet_whatever_its_hash(
+    done: Path, content: bytes, found: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = enter(done)
+    sheet_path(path).write_bytes(content)
+    edit_with_ledger(path, lambda e: e["thumbnails"].update(sha256=hashlib.sha256(content).hexdigest()))
+    (line,) = [line for line in problems(done, capsys) if "leaderboard.json" not in line]
+    assert f"expected a lossy WebP image of 120x48 pixels, found {found};" in line
+
+
+def test_a_large_file_is_not_read(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = enter(done)
+    monkeypatch.setattr(thumbnails, "MOST_BYTES", 100)
+    with pytest.raises(UserError, match="100 bytes at most"):
+        read_sheet(sheet_path(path), json.loads(path.read_text())["thumbnails"])
+
+
+def test_an_edit_of_what_the_sheet_shows_is_an_edit_of_the_entry(done: Path) -> None:
+    path = enter(done)
+    edit_json(path, lambda e: e["thumbnails"]["scenes"]["pattern-0"].update(target="cam_03/000020"))
+    with pytest.raises(UserError, match="expected an entry as LEDGER lists it"):
+        read(path)
