@@ -68,9 +68,9 @@ def build(
 ) -> int:
     """Write the leaderboard as a page of files, which a browser opens from the disk.
 
-    The page has every board of the leaderboard, and the published entries. With --runs it has the reader's own
-    finished runs beside the entries, and their images where --data has the scenes: a run that equals an entry lends its
-    images to the entry. An earlier page in the folder is replaced.
+    The page has every board of the leaderboard, and the published entries, with an image of each scene where an entry
+    has a sheet. With --runs it has the reader's own finished runs beside the entries, and all their images where --data
+    has the scenes: a run that equals an entry lends its images to the entry. An earlier page in the folder is replaced.
 
     Args:
         out: Folder of the page.

@@ -30,7 +30,7 @@ def submit(
 
     With predictions and scenes, every hash and every score is computed again and the entry is labelled re-scored;
     with --refit the method is fitted again too, by a process that is given the training parts of the scenes alone, and
-    the entry is labelled re-fitted. Anything else is claimed and
+    the entry is labelled re-fitted. Both get a small sheet of images for the page. Anything else is claimed and
     gets no rank. A record of a track's scenes and revisions is on that track's board, any other on a local one.
     Submitting a record twice changes nothing.
 

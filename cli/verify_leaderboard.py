@@ -27,7 +27,7 @@ def verify_leaderboard(
     refit: bool = False,
     container: str = "",
 ) -> int:
-    """Check a leaderboard folder: the release is the frozen one, entries are as submitted, boards follow from them.
+    """Check a leaderboard: the release is the frozen one, entries and sheets are as submitted, boards follow from them.
 
     With predictions and scenes, entries are scored again too, as far as their files are there, and what they say of
     their verification is compared with what comes out. That takes half a minute a scene for second renderings of a

@@ -225,9 +225,9 @@ def write_entry(
 ) -> Entry:
     """Write a record's entry, or keep the one that makes the same claim; return the entry in the leaderboard.
 
-    An entry that makes the same claim takes over a better verification, and thumbnails if its own are missing. The
-    caller holds the leaderboard's lock. Raises UserError where the method has another record there, unless `replace`,
-    and where another method's name differs by case alone.
+    An entry that makes the same claim takes over a better verification, and thumbnails if its own are missing or
+    with `replace`. The caller holds the leaderboard's lock. Raises UserError where the method has another record there,
+    unless `replace`, and where another method's name differs by case alone.
     """
     name = entry_path(record)
     path = leaderboard / name
@@ -246,7 +246,7 @@ def write_entry(
         else:
             if _claim(old["record"]) == _claim(record):
                 better = _confidence(entry) > _confidence(old)
-                if has_sheet(path, old):
+                if has_sheet(path, old) and not replace:
                     thumbnails = None
                 if not better and thumbnails is None:
                     return old

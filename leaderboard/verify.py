@@ -25,7 +25,7 @@ from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.leaderboard.entry import CLAIMED, FOLDERS, RE_FITTED, Entry, check_folder
 from spike4dgs.leaderboard.rank import FILES, flags_of, make_boards
 from spike4dgs.leaderboard.reading import Reading, read_all
-from spike4dgs.leaderboard.thumbnails import KEY, read_sheet, sheet_path, sheets
+from spike4dgs.leaderboard.thumbnails import KEY, check_sheet, make_thumbnails, read_sheet, sheet_path, sheets
 from spike4dgs.leaderboard.tracks import match_release
 from spike4dgs.leaderboard.truth_check import Renderings, SecondRenderings, TruthCheck, check_truth, no_renderings
 
@@ -255,6 +255,9 @@ def _score_again(
     known = {flag.partition(" (")[0] for flag in flags_of(entry)}
     if new := [flag for flag in flags if flag.partition(" (")[0] not in known]:
         raise problem(where, f"the flags {'; '.join(new)}", "none of them", "submit the record again with --replace")
+    if KEY in entry:
+        made = make_thumbnails(record, predictions / record["method"]["name"], scenes)
+        check_sheet(sheet_path(where), entry[KEY], made)
 
 
 def _check_truth(where: str, stated: Mapping[str, Any], found: TruthCheck) -> None:

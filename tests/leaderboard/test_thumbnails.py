@@ -14,7 +14,7 @@ import pytest
 from changes import edit_json, files_in
 from dummy_methods import CountMethod, run
 from PIL import Image
-from submissions import edit_with_ledger, enter, read
+from submissions import edit_with_ledger, enter, read, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.error_map import SCALES
@@ -23,6 +23,7 @@ from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_mask
 from spike4dgs.cli import main
 from spike4dgs.leaderboard import entry, thumbnails
 from spike4dgs.leaderboard.thumbnails import read_sheet, sheet_path
+from spike4dgs.leaderboard.verify import verify_leaderboard
 
 MIDDLE, WIDTH, HEIGHT = "cam_03/000040", 40, 24
 
@@ -199,3 +200,44 @@ def test_an_edit_of_what_the_sheet_shows_is_an_edit_of_the_entry(done: Path) -> 
     edit_json(path, lambda e: e["thumbnails"]["scenes"]["pattern-0"].update(target="cam_03/000020"))
     with pytest.raises(UserError, match="expected an entry as LEDGER lists it"):
         read(path)
+
+
+def forged(path: Path, sheet: bytes) -> None:
+    """Exchange a sheet as somebody who also knows the entry and the ledger would."""
+    sheet_path(path).write_bytes(sheet)
+    edit_with_ledger(path, lambda e: e["thumbnails"].update(sha256=hashlib.sha256(sheet).hexdigest()))
+
+
+def test_a_sheet_that_shows_other_images_is_found_where_the_entry_is_scored_again(done: Path) -> None:
+    path = enter(done)
+    honest = sheet_path(path).read_bytes()
+    scenes, predictions = (done / "s0", done / "s1"), done / "out/predictions"
+    levels = np.asarray(Image.open(sheet_path(path)).convert("L"))
+    other = levels.copy()
+    other[30:40, 50:60] = 255 - other[30:40, 50:60]
+
+    def encoded(image: np.ndarray, quality: int) -> bytes:
+        out = io.BytesIO()
+        Image.fromarray(image).convert("RGB").save(out, "WEBP", quality=quality)
+        return out.getvalue()
+
+    def found() -> list[str]:
+        submit(done / "out/results/bad.json", leaderboard=done / "board")  # the boards are as the entries give them
+        assert not verify_leaderboard(done / "board").problems
+        return list(verify_leaderboard(done / "board", predictions, scenes).problems)
+
+    forged(path, encoded(levels, 40))
+    assert found() == [], "another encoder"
+    forged(path, encoded(other, 90))
+    (line,) = found()
+    assert line.startswith(f"{sheet_path(path)}: expected the images that were scored, found others, by ")
+    forged(path, honest[:200] + b"\0" * (len(honest) - 200))
+    (line,) = found()
+    assert line.startswith(f"{sheet_path(path)}: expected")
+    enter(done)
+    assert sheet_path(path).read_bytes() != honest, "it is as its entry states"
+    enter(done, replace=True)
+    assert sheet_path(path).read_bytes() == honest and found() == []
+    edit_with_ledger(path, lambda e: e["thumbnails"]["scenes"]["pattern-0"].update(target="cam_03/000020"))
+    (line,) = found()
+    assert "expected thumbnails of pattern-0 cam_03/000040 40x24, pattern-1 cam_03/000040 40x24, found" in line
