@@ -23,7 +23,7 @@ Spike4DGS.app = (() => {
   /* Return {rows, better, leftOut} of the view's metric and scenes: as built where all scenes count, else computed.
      Null where that takes a while and was not done yet; `wait` does it. */
   function comparison(view, state, wait) {
-    if (!view.metric) return { rows: [], better: [], leftOut: {} };
+    if (!view.board.scored.length) return { rows: [], better: [], leftOut: {} };
     const number = page.boards.indexOf(view.board);
     const scores = Spike4DGS.ready(`scores-${number}-${view.metric}`);
     if (!scores) return null;
@@ -63,7 +63,7 @@ Spike4DGS.app = (() => {
     if (!found) {
       Spike4DGS.table.draw(page, state, view, null, {}, act);
       document.body.dataset.drawn = location.hash || "#";
-      if (view.metric) await Spike4DGS.load(`scores-${page.boards.indexOf(board)}-${view.metric}`);
+      await Spike4DGS.load(`scores-${page.boards.indexOf(board)}-${view.metric}`);
       await painted();
       if (turn !== drawing) return;
       found = comparison(view, state, true);

@@ -11,7 +11,7 @@ Spike4DGS.compare = (() => {
     const { board } = view;
     const number = page.boards.indexOf(board);
     const [pictures, scores] = await Promise.all([
-      Spike4DGS.load(`pictures-${number}`), view.metric ? Spike4DGS.load(`scores-${number}-${view.metric}`) : null]);
+      Spike4DGS.load(`pictures-${number}`), board.scored.length ? Spike4DGS.load(`scores-${number}-${view.metric}`) : null]);
     if (turn !== drawing) return;
     if (!scores) return void fill(byId("scenes"));
     const s = Math.max(0, board.scenes.findIndex((scene) => scene.id === state.scene));

@@ -96,7 +96,7 @@ Spike4DGS.controls = (() => {
     const every = el("button", { type: "button", onclick: () => change({ scenes: null }) }, "All scenes");
     const legend = el("legend", {});
     const open = byId("controls").querySelector("details")?.open ?? window.matchMedia("(min-width: 60rem)").matches;
-    const ranked = board.scored.map((id) => [id, heading(page.index.get(id))]);
+    const ranked = Spike4DGS.model.metricsOf(board).map((id) => [id, heading(page.index.get(id))]);
     const number = { type: "number", min: "0", step: "any", inputmode: "decimal" };
     fill(byId("controls"),
       el("div", { class: "fields" },

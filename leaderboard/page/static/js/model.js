@@ -66,13 +66,18 @@ Spike4DGS.model = (() => {
     return scenes.reduce((sum, s) => sum + values[s], 0) / scenes.length;
   }
 
-  const primaryOf = (page, board, state) =>
-    board.scored.includes(state.m) ? state.m : board.scored.includes(page.primary) ? page.primary : board.scored[0];
+  /* Return the metrics to choose from: those that rows are compared by, or the usual ones where no row may be ranked. */
+  const metricsOf = (board) => (board.scored.length ? board.scored : DEFAULT_COLUMNS);
+
+  function primaryOf(page, board, state) {
+    const known = metricsOf(board);
+    return known.includes(state.m) ? state.m : known.includes(page.primary) ? page.primary : known[0];
+  }
 
   /* Return the metrics that are columns: the one ranked by first, then the usual ones that any row has. */
   function columns(page, board, metric) {
-    const ids = [metric, ...DEFAULT_COLUMNS.filter((m) => m !== metric && board.scored.includes(m)), ...COSTS];
-    return ids.filter(Boolean).map((id) => page.index.get(id));
+    const ids = [metric, ...DEFAULT_COLUMNS.filter((m) => m !== metric && metricsOf(board).includes(m)), ...COSTS];
+    return ids.map((id) => page.index.get(id));
   }
 
   /* Return why a row is hidden by the filters, or an empty text. */
@@ -130,5 +135,5 @@ Spike4DGS.model = (() => {
     };
   }
 
-  return { COSTS, facetValues, view };
+  return { COSTS, facetValues, metricsOf, view };
 })();

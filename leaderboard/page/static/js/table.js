@@ -46,9 +46,10 @@ Spike4DGS.table = (() => {
       el("td", { class: "nowrap", title: PROOFS[item.row.label] }, labelOf(item.row)));
     const body = el("tbody", {}, rows.slice(0, SCREEN).map(line));
     rest = () => body.append(...rows.slice(SCREEN).map(line));
+    const ranked = `ranks by ${heading(metric)} among the rows shown, with ${Math.round(100 * page.bootstrap.level)} % intervals that hold `
+      + "together; methods that cannot be told apart tie (=).";
     const caption = el("caption", {}, el("div", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
-      `ranks by ${heading(metric)} among the rows shown, with ${Math.round(100 * page.bootstrap.level)} % intervals that hold together; `,
-      "methods that cannot be told apart tie (=)."));
+      view.board.scored.length ? ranked : "no row of this board is ranked."));
     // The page keeps its height meanwhile: what is read further down does not jump.
     if (rows.length > SCREEN) byId("scroller").style.minHeight = `${byId("scroller").offsetHeight}px`;
     fill(byId("table"), caption, head, body);
