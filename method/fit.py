@@ -17,7 +17,8 @@ from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.base import ImageMaker
-from spike4dgs.method.images.light import Light, light_of
+from spike4dgs.method.images.light import Light
+from spike4dgs.method.images.local_light import light_of
 from spike4dgs.method.images.recorded import Recorded, RecordedImages, warm_up_images, without_spikes
 from spike4dgs.method.images.training import (
     ImageSettings,
@@ -56,7 +57,7 @@ class FitJob:
     settings: Mapping[str, Any]  # by part, step counts scaled by the budget
     request: FitRequest
     key: str
-    light: Light | None = None  # what changes in the whole scene's light, which the images leave out
+    light: Light | None = None  # what changes in the scene's light
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class Algorithm:
     calibrated: bool = False  # its loss compares with spikes of the cameras' calibrated response
     rasterizes: bool = True  # renders Gaussians, which on CUDA needs numba-cuda
     refines: bool = True  # its models have `refine`
+    layers: bool = False  # it knows `TrainingImages.light`: its gray is the first channel
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,7 @@ class RecipeMethod(Shown):
                 algorithm, settings = self._static(settings)
         else:
             maker = self.images.with_settings(settings.get("image_maker", self.images.settings))
-            light = light_of(scene) if maker.knows_light else None
+            light = light_of(scene, algorithm.layers) if maker.knows_light else None
             images = make_training_images(scene, start.cameras, maker, settings["images"], request.device, light)
         key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])
         extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]))
@@ -208,8 +210,7 @@ class RecipeMethod(Shown):
             return scaled(self.settings, request.budget.scale)
         where = f"recipe {self.name}"
         if not (steps := self.algorithm.published):
-            fix = "choose another budget"
-            raise problem(where, "a publication's step counts for --budget paper", "none", fix)
+            raise problem(where, "a publication's step counts for --budget paper", "none", "choose another budget")
         return override(self.settings, steps, where)
 
 
@@ -259,7 +260,8 @@ def trainer_algorithm(recipe: Recipe, parts: Parts) -> Algorithm:
     def fit(job: FitJob) -> FittedModel:
         return fit_gaussians(job, MotionSpec(recipe.motion, job.extent, job.settings["motion"]), motion, supervision)
 
-    return Algorithm(motion.label, settings, fit, motion.published, calibrated=supervision.calibrated)
+    gray = motion.image is Motion.image
+    return Algorithm(motion.label, settings, fit, motion.published, calibrated=supervision.calibrated, layers=gray)
 
 
 def fit_gaussians(

@@ -38,6 +38,7 @@ from spike4dgs.method.supervision.base import Sample, Supervision
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.training_views.foreground import moving_points
 from spike4dgs.method.training_views.instants import Corrections, RenderViews
+from spike4dgs.method.training_views.light_layers import factor_at, lit, with_layers
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 
@@ -68,6 +69,7 @@ class Trainer:
         self.plan = stages(settings, motion.moves, motion.rests_first, motion.pieces)
         self.total = sum(s.steps for s in self.plan)
         self.step = 0
+        gaussians = with_layers(gaussians, images)
         self.gaussians = gaussians.trainable()
         self.ended: dict[int, Gaussians] = {}  # the pieces of the clip that are fitted
         self.background = gaussians.rows(torch.zeros(len(gaussians), dtype=torch.bool))  # none yet; frozen
@@ -159,8 +161,7 @@ class Trainer:
         def render_at(t: float) -> Tensor:
             splats = self.motion.splats(self.gaussians, stage.within(t)) if stage.deforms else self.gaussians.splats()
             outputs.append(self._image(splats, chosen, views))
-            image = outputs[-1].image
-            return self.motion.image(image, views) if stage.deforms else image[..., 0]
+            return self._gray(outputs[-1].image, views, stage, t)
 
         set_learning_rates(self.adam, self.learning_rates, stage.fraction(self.step))
         self.adam.zero_grad(set_to_none=True)
@@ -195,8 +196,9 @@ class Trainer:
 
         def around(index: int) -> RenderViews:
             def render_views(ticks: float, chosen: Sequence[int]) -> Tensor:
-                t, views = stage.within((training.ticks[index] + ticks) / training.n_ticks), training.views.some(chosen)
-                return fit.motion.image(fit._image(fit.motion.splats(snapshot, t), chosen, views).image, views)
+                at, views = (training.ticks[index] + ticks) / training.n_ticks, training.views.some(chosen)
+                splats = fit.motion.splats(snapshot, stage.within(at))
+                return fit._gray(fit._image(splats, chosen, views).image, views, stage, at)
 
             return render_views
 
@@ -215,6 +217,12 @@ class Trainer:
         if self.projected:
             return self.projected.render(splats, chosen)
         return render(splats, views, self.settings.pixel_filter)
+
+    def _gray(self, channels: Tensor, views: Views, stage: Stage, t: float) -> Tensor:
+        """Return gray radiance [V, H, W] in the light of a time of the clip, from rendered channels [V, H, W, F]."""
+        gray = self.motion.image(channels, views) if stage.deforms else channels[..., 0]
+        factors = self.training_images.light
+        return gray if factors is None else lit(gray, channels, factor_at(factors, t))
 
     def _adapt_density(self, stage: Stage) -> None:
         s, done, views = self.density, self.step - stage.first, self.training_images.views

@@ -34,6 +34,7 @@ from spike4dgs.benchmark.spikes.lost_spikes import doubtful_between, fewest, mos
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains
 from spike4dgs.method.images.base import ImageMaker
+from spike4dgs.method.images.light import PixelLight, steady
 from spike4dgs.method.settings import Settings
 
 
@@ -59,11 +60,11 @@ def half_windows(n_ticks: int, settings: AdaptiveSettings | None = None) -> NDAr
 
 
 def adaptive_image(
-    stream: SpikeStream, tick: int, settings: AdaptiveSettings | None = None, light: Float64 | None = None
+    stream: SpikeStream, tick: int, settings: AdaptiveSettings | None = None, light: PixelLight | None = None
 ) -> Float32:
     """Return spikes per tick [H, W] float32 at the start of `tick`, each over its pixel's own window.
 
-    `light` [n_ticks] is what `images.light.Light.gathered` has of it; None: it is steady.
+    They are those of mean light, or of the tick's own where `light` has shares; None: light is steady.
     """
     s = settings or AdaptiveSettings()
     levels = shared_levels(stream, tick, s, light)
@@ -71,20 +72,19 @@ def adaptive_image(
     return image[::-1] if stream.rows_bottom_up else image
 
 
-def rates(stream: SpikeStream, tick: int, s: AdaptiveSettings, levels: UInt8, light: Float64 | None = None) -> Float32:
+def rates(
+    stream: SpikeStream, tick: int, s: AdaptiveSettings, levels: UInt8, light: PixelLight | None = None
+) -> Float32:
     """Return spikes per tick [H * W] over the windows of `shared_levels`, in the stored order of pixels."""
     image = np.empty(len(levels), np.float32)
     arguments = (*_arguments(stream, tick, s, light), levels, image)
     in_threads(_estimate, len(levels), *arguments, small=len(levels) < 1 << 12)
+    if light and len(light.shares):
+        image *= light.at(tick)
     return image
 
 
-def gathered(stream: SpikeStream, light: Float64 | None) -> Float64:
-    """Return the light gathered up to the middle of each tick [n_ticks]; of steady light where `light` is None."""
-    return np.arange(0.5, stream.n_ticks) if light is None else light
-
-
-def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Float64 | None = None) -> UInt8:
+def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: PixelLight | None = None) -> UInt8:
     """Return the window that each pixel takes [H * W], an index into `half_windows`, in the stored order of pixels."""
     pixels = stream.height * stream.width
     level = np.empty(pixels, np.uint8)
@@ -93,11 +93,31 @@ def shared_levels(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Fl
     return np.asarray(cv2.erode(level.reshape(stream.height, stream.width), square).reshape(-1), np.uint8)
 
 
-def _arguments(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: Float64 | None) -> tuple[Any, ...]:
+def _arguments(stream: SpikeStream, tick: int, s: AdaptiveSettings, light: PixelLight | None) -> tuple[Any, ...]:
     """Return what both kernels take: the trains, its light, the tick, and the windows' ticks [starts, stops)."""
     trains, halves = spike_trains(stream), half_windows(stream.n_ticks, s)
     edges = np.ceil([tick - halves, tick + halves]).clip(0, stream.n_ticks).astype(np.int64)
-    return *trains.arrays, gathered(stream, light), tick, *edges
+    own = light or steady(stream.n_ticks)
+    return *trains.arrays, own.gathered, own.shares, tick, *edges
+
+
+@kernel
+def _between(light: Float64, shares: Float32, p: int, first: int, last: int) -> float:
+    """Return the light that a pixel's scene gets between two ticks; `light` is that of all pixels without shares."""
+    length = light[last] - light[first]
+    if len(shares) > 0:
+        length = (last - first) + shares[p] * (length - (last - first))
+    return length
+
+
+@kernel
+def _of_a_tick(light: Float64, shares: Float32, p: int, first: int, last: int) -> float:
+    """Return by how much `_between` is off at most: half the light of both ticks, as a spike is anywhere in its own."""
+    if len(shares) == 0:
+        return 1.0
+    end = len(light) - 1
+    both = light[min(first + 1, end)] - light[max(first - 1, 0)] + light[min(last + 1, end)] - light[max(last - 1, 0)]
+    return max(1.0, 1 + shares[p] * (both / 4 - 1))
 
 
 @kernel
@@ -108,6 +128,7 @@ def _choose(
     doubt_words: UInt64,
     doubt_before: UInt32,
     light: Float64,
+    shares: Float32,
     tick: int,
     starts: Int64,
     stops: Int64,
@@ -135,12 +156,13 @@ def _choose(
             if k > j:
                 j, last, wider = k, last_before(words, p, stops[s]), True
             if wider and j > i:
-                length = light[last] - light[first]
+                length = _between(light, shares, p, first, last)
                 doubt, filled = 0, 0
                 if lost[last] > lost[first]:
                     doubt, filled = doubtful_between(lost, doubt_words, doubt_before, p, first, last)
-                low = max(low, fewest(j - i, filled, doubt) / (length + 1))
-                high = min(high, most(j - i, filled, doubt) / (length - 1) if length > 1 else np.inf)
+                off = _of_a_tick(light, shares, p, first, last)
+                low = max(low, fewest(j - i, filled, doubt) / (length + off))
+                high = min(high, most(j - i, filled, doubt) / (length - off) if length > off else np.inf)
                 if low > high:
                     level[p] = s - 1
                     break
@@ -155,6 +177,7 @@ def _estimate(
     doubt_words: UInt64,
     doubt_before: UInt32,
     light: Float64,
+    shares: Float32,
     tick: int,
     starts: Int64,
     stops: Int64,
@@ -182,7 +205,7 @@ def _estimate(
                 filled = 0
                 if lost[last] > lost[first]:
                     _, filled = doubtful_between(lost, doubt_words, doubt_before, p, first, last)
-                image[p] = np.float32((j - i + filled) / (light[last] - light[first]))
+                image[p] = np.float32((j - i + filled) / _between(light, shares, p, first, last))
                 break
 
 

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, Float64
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.weights import FoundWeights
+from spike4dgs.method.images.light import PixelLight
 from spike4dgs.method.settings import Settings
 
 
@@ -88,12 +89,12 @@ class ImageMaker(Shown):
         """Return the same maker with its network, if it has one, on `device`."""
         return self.made_on(device) if self.made_on else self
 
-    def in_light(self, gathered: Float64) -> ImageMaker:
-        """Return the same maker in light that changes, if it knows any: its rates are those of mean light."""
+    def in_light(self, light: PixelLight) -> ImageMaker:
+        """Return the same maker in light that changes, if it knows any: see `PixelLight` for its rates."""
         if not self.knows_light:
             return self
-        over = self.rate_over and partial(self.rate_over, light=gathered)
-        return replace(self, rate=partial(self.rate, light=gathered), rate_over=over)
+        over = self.rate_over and partial(self.rate_over, light=light)
+        return replace(self, rate=partial(self.rate, light=light), rate_over=over)
 
     def __call__(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None

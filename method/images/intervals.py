@@ -33,8 +33,9 @@ from spike4dgs.benchmark.spikes.bits import in_threads, kernel
 from spike4dgs.benchmark.spikes.lost_spikes import doubtful_between, is_doubtful
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains
-from spike4dgs.method.images.adaptive import AdaptiveSettings, gathered, half_windows, rates, shared_levels
+from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows, rates, shared_levels
 from spike4dgs.method.images.base import ImageMaker
+from spike4dgs.method.images.light import PixelLight, steady
 
 MOVED = 0.5  # of h, at most, that a window's middle moves to lie between lost ticks
 FOLLOWED = 2.0  # times h from the tick, at most, that a moved span ends: beyond it a fit follows no span
@@ -63,25 +64,27 @@ def half_spans(n_ticks: int, settings: IntervalSettings) -> Float32:
 
 
 def interval_image(
-    stream: SpikeStream, tick: int, settings: IntervalSettings | None = None, light: Float64 | None = None
+    stream: SpikeStream, tick: int, settings: IntervalSettings | None = None, light: PixelLight | None = None
 ) -> Float32:
     """Return spikes per tick [H, W] float32, each the mean over its pixel's span around `tick`."""
     return intervals(stream, tick, settings, light)[0]
 
 
 def intervals(
-    stream: SpikeStream, tick: int, settings: IntervalSettings | None = None, light: Float64 | None = None
+    stream: SpikeStream, tick: int, settings: IntervalSettings | None = None, light: PixelLight | None = None
 ) -> tuple[Float32, Float32]:
     """Return spikes per tick [H, W] and the spans [2, H, W] that they are means over; see the module.
 
-    `light` [n_ticks] is what `images.light.Light.gathered` has of it; None: it is steady.
+    They are those of mean light; where `light` has shares, of the light that there is. None: light is steady. With
+    shares a pixel whose window is long has the rate of `tick` itself, and an empty span.
     """
     s = settings or IntervalSettings()
-    trains, pixels, changing = spike_trains(stream), stream.height * stream.width, gathered(stream, light)
+    trains, pixels, apart = spike_trains(stream), stream.height * stream.width, bool(light and len(light.shares))
+    changing = light.gathered if light and not apart else steady(stream.n_ticks).gathered
     levels = shared_levels(stream, tick, s, light)
     rate, halves = rates(stream, tick, s, levels, light), half_spans(stream.n_ticks, s)[levels]
     spans = np.empty((2, pixels), np.float32)
-    spans[0], spans[1] = -s.half, s.half
+    spans[0], spans[1] = (0, 0) if apart else (-s.half, s.half)
     in_threads(
         _measure, pixels, *trains.arrays, np.flatnonzero(np.diff(trains.lost)), tick, halves, changing, rate, spans
     )

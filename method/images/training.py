@@ -10,12 +10,14 @@ import numpy as np
 import torch
 
 from spike4dgs.benchmark.arrays import Float32, Half
-from spike4dgs.benchmark.scene.camera_state import local_ticks
+from spike4dgs.benchmark.scene.camera_state import Clock, local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import spike_trains
 from spike4dgs.method.images.base import ImageMaker
-from spike4dgs.method.images.light import Light
+from spike4dgs.method.images.light import Light, PixelLight
+from spike4dgs.method.images.local_light import shared
 from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
@@ -55,7 +57,8 @@ def make_training_images(
 ) -> TrainingImages:
     """Return images of all training views at the chosen times, at the streams' pixels; `cameras` have the fit's poses.
 
-    `light` is what changes in the whole scene's light, if anything: makers that know of it show mean light.
+    `light` is what changes in the scene's light, if anything: makers that know of it show mean light. Where it is a
+    lamp's they show the light that there is, and the images say so.
     """
     ticks, made, measured = _make(scene, make, settings, device, light)
     images = torch.from_numpy(made).to(device)
@@ -63,9 +66,8 @@ def make_training_images(
     masks = None if bad is None else torch.from_numpy(np.stack(bad)).to(device)
     lacking = None if missing is None else torch.from_numpy(missing).to(device)
     spans = None if measured is None else _spans(scene, measured, device)
-    return TrainingImages(
-        Views.from_cameras(cameras, device=device), ticks, images, scene.n_ticks, masks, lacking, spans
-    )
+    views, lamp = Views.from_cameras(cameras, device=device), light.factors if light and light.local else None
+    return TrainingImages(views, ticks, images, scene.n_ticks, masks, lacking, spans, light=lamp)
 
 
 def recorded_training_images(
@@ -101,7 +103,7 @@ def _make(
         own, _ = local_ticks(state.clock, ticks, scene.n_ticks)
         calibration = scene.calibrations[c] if settings.flat_field and scene.calibrations else None
         gain = scene.radiance_gain * (1.0 if calibration else state.gain)
-        lit = make.in_light(light.gathered(state.clock, stream.n_ticks)) if light else make
+        lit = make.in_light(_own_light(light, stream, state.clock)) if light else make
         images[:, c], over = lit.with_spans(stream, own, gain, calibration)
         if over is not None:
             spans.append(over.astype(np.float16))
@@ -110,10 +112,17 @@ def _make(
     return ticks, images, spans or None
 
 
+def _own_light(light: Light, stream: SpikeStream, clock: Clock) -> PixelLight:
+    """Return the light of one camera's clip."""
+    gathered = light.gathered(clock, stream.n_ticks)
+    return shared(stream, gathered) if light.local else PixelLight(gathered)
+
+
 def _spans(scene: TrainingScene, measured: list[Half], device: str) -> Spans:
     """Return the spans of time that the training images [T, C] are means over."""
     ends = np.stack(measured, axis=1)
-    half = float(np.median((ends[:, :, 1] - ends[:, :, 0]).astype(np.float32))) / 2
+    lengths = (ends[:, :, 1] - ends[:, :, 0]).astype(np.float32)
+    half = float(np.median(lengths[lengths > 0] if (lengths == 0).any() else lengths)) / 2
     return Spans(torch.from_numpy(ends).to(device), half, scene.n_ticks)
 
 

@@ -38,6 +38,7 @@ from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.background import Repeated, join
 from spike4dgs.method.splat.types import PixelFilter
 from spike4dgs.method.torch_state import one_torch_thread
+from spike4dgs.method.training_views.light_layers import factor_at, lit
 
 _MOST_OF_ANYTHING = 4096  # that a file's settings may ask for
 
@@ -129,7 +130,7 @@ class FittedModel(GaussianModel):
     cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit left them; not saved
     pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
     estimates: Mapping[str, Tensor] = field(default_factory=dict)  # the supervision's, beside the scene; not saved
-    light: Tensor | None = None  # factors of the light over equal parts of the clip [n]; None: it is steady
+    light: Tensor | None = None  # factors of all light, or of the lamp's layer, over equal parts of the clip [n]
 
     def _about(self) -> str:
         moving = ", ".join(str(len(g)) for g in self.pieces)
@@ -151,19 +152,33 @@ class FittedModel(GaussianModel):
         """Render one view [1, H, W]; the same bits with the background kept from an earlier time as without."""
         still = self._repeated.in_view(view) if len(self.background) else None
         if still is None:
-            image = self.rendered(self.splats(t_us), view)
+            channels = render(self._all(t_us), view, self.pixel_filter).image
         else:
-            image = self.image(still.render(self._moving(t_us), [0]).image, view)
-        return image if self.light is None else image * self._light_at(t_us)
+            channels = still.render(self._moving(t_us), [0]).image
+        image = self.image(channels, view)
+        if self.light is None:
+            return image
+        factor = self._light_at(t_us)
+        return lit(image, channels, factor) if self._layered else image * factor
+
+    @property
+    def _layered(self) -> bool:
+        """Whether colours have a layer of a lamp, see `light_layers`."""
+        return self.light is not None and self.background.colors.shape[1] == 2
 
     def _light_at(self, t_us: float) -> float:
         """Return the factor of the light at a time, linear between the middles of the parts of `light`."""
         assert self.light is not None
-        factors = self.light.double().cpu().numpy()
-        return float(np.interp(t_us / self.duration_us * len(factors) - 0.5, np.arange(len(factors)), factors))
+        return factor_at(self.light.double().cpu().numpy(), t_us / self.duration_us)
 
     def splats(self, t_us: float) -> Splats:
-        """Return what is rendered at `t_us`."""
+        """Return what is rendered at `t_us`; a lamp's layer is in the gray values."""
+        splats = self._all(t_us)
+        if not self._layered:
+            return splats
+        return Splats(*splats.geometry, lit(splats.colors[:, :1], splats.colors[:, None], self._light_at(t_us)))
+
+    def _all(self, t_us: float) -> Splats:
         moving = self._moving(t_us)
         return join(self._repeated.splats, moving) if len(self.background) else moving
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from spike4dgs.method.splat import Views
 from spike4dgs.method.training_views.changes import MASKS, changing, without_specks
+from spike4dgs.method.training_views.light_layers import in_mean_light
 from spike4dgs.method.training_views.points import project, variation_at
 from spike4dgs.method.training_views.training_images import TrainingImages
 
@@ -63,6 +64,7 @@ def moving_points(points: Tensor, images: TrainingImages, limit: float) -> Tenso
 
     And those in the foreground: light is constant inside of a uniform surface, though it moves.
     """
+    images = in_mean_light(images)
     masks = foreground_masks(images.images)
     return (variation_at(points, images) > limit) | foreground_points(points, images.views, masks)
 

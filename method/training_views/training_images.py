@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.gaps import present
@@ -42,6 +43,7 @@ class TrainingImages:
     missing: Tensor | None = None  # bool [T, C], images where a recording lacks most ticks; None: there are none
     spans: Spans | None = None  # of [T, C]; None: the images show instants
     exposure_ticks: int = 0  # that images of another sensor are means over, from tick - exposure_ticks // 2 on
+    light: Float64 | None = None  # factors [n_ticks] of a lamp that the images show; None: they show one light
 
     def measured(self, index: int) -> Tensor:
         """Return the images [C, H, W] of one time for a loss: NaN where nothing was measured."""

@@ -18,6 +18,7 @@ from small_scenes import write_small_scene
 from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.models.model_file import ModelFile, read_model, write_model
 from spike4dgs.method.models.saved_model import load_model
@@ -94,6 +95,23 @@ def test_a_model_keeps_the_light_that_it_was_fitted_in(tmp_path: Path) -> None:
         image = loaded.render(WORLD.held_out, share * DURATION_US)
         np.testing.assert_array_equal(image, lit.render(WORLD.held_out, share * DURATION_US))
         np.testing.assert_allclose(image, factor * steady.render(WORLD.held_out, share * DURATION_US), rtol=1e-5)
+
+
+def test_a_model_keeps_the_layer_of_a_lamp(tmp_path: Path) -> None:
+    """A layer of all light is light of one factor."""
+    steady, factors = model("paths"), torch.tensor([0.5, 1.0, 1.5, 1.0])
+
+    def layered(g: Gaussians) -> Gaussians:
+        return dataclasses.replace(g, colors=g.colors.repeat(1, 2))
+
+    both = {"pieces": tuple(map(layered, steady.pieces)), "background": layered(steady.background)}
+    lit, whole = dataclasses.replace(steady, light=factors, **both), dataclasses.replace(steady, light=factors)
+    lit.save(tmp_path / "m", provenance())
+    loaded = load_model(tmp_path / "m").model
+    for share in (0.0, 0.25, 0.6):
+        image = loaded.render(WORLD.held_out, share * DURATION_US)
+        np.testing.assert_array_equal(image, lit.render(WORLD.held_out, share * DURATION_US))
+        np.testing.assert_allclose(image, whole.render(WORLD.held_out, share * DURATION_US), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("factors", [[[1.0]], [], [1.0, float("nan")], [-1.0]])
