@@ -53,7 +53,7 @@ def run_block(self: Any, grid_point: Any, *args: Any) -> None:
         raise failed[0][0].with_traceback(failed[0][1])
 
 
-def small(splats: Splats, v: Views, count: int = 12) -> tuple[Splats, Views]:
+def small(splats: Splats, v: Views, count: int = 24) -> tuple[Splats, Views]:
     """Return some of the Gaussians in smaller images of the first view or two."""
     step = max(1, len(splats) // count)
     K = v.K.clone()
@@ -64,7 +64,7 @@ def small(splats: Splats, v: Views, count: int = 12) -> tuple[Splats, Views]:
 
 def behind_and_over() -> None:
     """A background and others in front of it against all of them at once: equal bits, and equal gradients."""
-    splats, v = small(random_splats(24, 2, seed=31), views(2), 24)
+    splats, v = small(random_splats(24, 2, seed=31), views(2))
     v = Views(torch.cat([views(2).w2c[:1], v.w2c]), v.K.repeat(2, 1, 1), v.width, v.height)
     behind = Splats(*(t[:18] for t in splats.tensors))
     # In a corner: the other tile is copied.
@@ -113,7 +113,7 @@ def lens_case(lens: tuple[float, ...]) -> Callable[[], None]:
 
     def compared() -> None:
         s, v = small(random_splats(24, 1, seed=33), views(1))
-        aside = torch.where(torch.arange(12) % 3 > 0, 1.0, 4.0)[:, None] ** torch.tensor([1.0, 1.0, 0.0])
+        aside = torch.where(torch.arange(24) % 3 > 0, 1.0, 4.0)[:, None] ** torch.tensor([1.0, 1.0, 0.0])
         wide = changed(s, means=s.means * aside, scales=s.scales * aside[:, :1])
         compare(wide, through(v, lens), "cuda", depth=True, antialiased=True)
 
