@@ -30,8 +30,12 @@ os.fsync = os.fdatasync = lambda fd: os.fstat(fd) and None
 
 
 def pytest_collection_finish() -> None:
-    """Modules and tests stay: the collector of garbage, which takes half a second to look through them, need not."""
+    """Modules and tests stay: the collector of garbage, which takes half a second to look through them, need not.
+
+    What tests leave behind is looked through once in a while, not after every few hundred new objects.
+    """
     gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
     gc.enable()
 
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.rendering.image_motion import KeyPlan, carried, key_plan, max_image_speed, spacings
-from spike4dgs.generators.rendering.mitsuba_scene import mitsuba_scene
+from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene, mitsuba_scene
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.render import make_tracer
 from spike4dgs.generators.rendering.scalar_tiles import load_sensor
@@ -30,6 +30,12 @@ NAMES = sorted(WORLDS)
 def name(request) -> str:
     """A world's name; all tests of one world come after each other, and build it once."""
     return request.param
+
+
+@pytest.fixture(scope="module")
+def scene(name) -> MitsubaScene:
+    """The world in Mitsuba, at any time."""
+    return mitsuba_scene(built(name))
 
 
 def all_parts(world: WorldScene) -> list[Part]:
@@ -97,10 +103,9 @@ def sensor_rays(camera: Camera, sent: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.array(ray.o).T + np.zeros((len(sent), 3)), np.array(ray.d).T
 
 
-def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name):
+def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name, scene):
     world = built(name)
     rig = cameras(world, WIDTH, HEIGHT)
-    scene = mitsuba_scene(world)
     scene.set_time(0.008)
     tracer = make_tracer(scene, rig, 0)
     rng = np.random.default_rng(0)
@@ -114,9 +119,8 @@ def test_points_that_mitsubas_rays_hit_project_to_where_the_rays_started(name):
         assert np.abs(uv - sent * [WIDTH, HEIGHT]).max() < 0.01
 
 
-def test_moving_triangles_are_where_the_world_says(name):
+def test_moving_triangles_are_where_the_world_says(name, scene):
     world, t_s = built(name), 0.0131
-    scene = mitsuba_scene(world)
     scene.set_time(t_s)
     rig = cameras(world, WIDTH, HEIGHT, (4,))
     rng = np.random.default_rng(0)

@@ -26,13 +26,12 @@ def turns_px(cameras) -> float:
 
 def test_right_poses_stay_and_poses_a_little_off_are_mended(capsys: pytest.CaptureFixture[str]) -> None:
     assert at_mended_poses(SCENE, 0) is SCENE and as_in_clip(SCENE, 0, poses=True) is SCENE
-    for seed in range(3):
-        given = given_cameras(SCENE.cameras, "none", Physics(pose_noise_deg=0.03), [seed])
-        off = replace(SCENE, cameras=given)
-        found = as_in_clip(off, 0, poses=True).cameras
-        assert turns_px(found) < 0.5 * turns_px(given)
-        assert "the given poses are off" in capsys.readouterr().err
-        assert as_in_clip(off, 0, poses=False) is off
+    given = given_cameras(SCENE.cameras, "none", Physics(pose_noise_deg=0.03), [0])
+    off = replace(SCENE, cameras=given)
+    found = as_in_clip(off, 0, poses=True).cameras
+    assert turns_px(found) < 0.5 * turns_px(given)
+    assert "the given poses are off" in capsys.readouterr().err
+    assert as_in_clip(off, 0, poses=False) is off
     again = as_in_clip(off, 0, poses=True).cameras
     assert all(np.array_equal(a.R, b.R) and np.array_equal(a.t, b.t) for a, b in zip(again, found, strict=True))
 

@@ -1,7 +1,8 @@
 """The kernels become machine code of ARM, for Linux and for macOS: no intrinsic of x86, and NEON's vectors.
 
 A child process lets numba compile for a generic processor with vectors of 8 floats, as on ARM, and hands each module to
-LLVM's compiler for ARM too, before numba's own turns it into code of this machine.
+LLVM's compiler for ARM too, before numba's own turns it into code of this machine. ARM's is not
+optimised, which would take long: the kernels themselves say where their vectors are.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from numba.core.codegen import CPUCodeLibrary
 llvm.initialize_all_targets()
 llvm.initialize_all_asmprinters()
 TRIPLES = ("aarch64-unknown-linux-gnu", "arm64-apple-macosx")
-machines = {t: llvm.Target.from_triple(t).create_target_machine(opt=2) for t in TRIPLES}
+machines = {t: llvm.Target.from_triple(t).create_target_machine(opt=0) for t in TRIPLES}
 made, add = [], CPUCodeLibrary.add_llvm_module
 
 def add_and_compile_for_arm(library, module):

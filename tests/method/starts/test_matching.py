@@ -10,6 +10,7 @@ import torch
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.matching.config import TINY
 from spike4dgs.method.matching.network import Matcher, points_of_cells
@@ -53,8 +54,14 @@ def test_true_matches_give_the_cameras_and_the_points_of_the_scene() -> None:
     assert np.median(np.abs(z[inside] / truth - 1)) < 0.01
 
 
-def test_the_shipped_network_places_the_cameras_of_a_world_that_it_never_saw() -> None:
-    errors = pose_errors(match_and_solve(SCENE, 0, "cpu", calibrated=True).cameras, SCENE.cameras)
+@pytest.fixture(scope="module")
+def placed() -> tuple[Camera, ...]:
+    """The network's cameras, with known intrinsics."""
+    return match_and_solve(SCENE, 0, "cpu", calibrated=True).cameras
+
+
+def test_the_shipped_network_places_the_cameras_of_a_world_that_it_never_saw(placed: tuple[Camera, ...]) -> None:
+    errors = pose_errors(placed, SCENE.cameras)
     assert errors.rotation_deg.max() < 0.5 and errors.translation_m.max() < 0.03 * errors.array_m
     free = match_and_solve(SCENE, 0, "cpu", calibrated=False)
     errors = pose_errors(free.cameras, SCENE.cameras)
@@ -74,12 +81,13 @@ def test_points_of_the_start_lie_on_the_surfaces() -> None:
     assert inside.sum() > 1000 and np.median(np.abs(z[inside] / expected - 1)) < 0.03
 
 
-def test_where_features_find_nothing_the_networks_poses_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    first = match_and_solve(SCENE, 0, "cpu", calibrated=True).cameras
+def test_where_features_find_nothing_the_networks_poses_stay(
+    placed: tuple[Camera, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     dark = np.zeros((8, 61, 96), np.float32)
     monkeypatch.setattr("spike4dgs.method.starts.matching.window_means", lambda *args, **options: dark)
     found = refined_poses(SCENE, 0, device="cpu").cameras
-    assert all(np.array_equal(a.w2c, b.w2c) for a, b in zip(found, first, strict=True))
+    assert all(np.array_equal(a.w2c, b.w2c) for a, b in zip(found, placed, strict=True))
 
 
 def test_inputs_are_those_of_all_views() -> None:
