@@ -69,9 +69,6 @@ def on_post_build(config: Any, **kwargs: Any) -> None:
 def on_page_markdown(markdown: str, page: Any, **kwargs: Any) -> str:
     """Expand the comments `include FILE [SECTION]`, `notebook FILE`, `names of ROOM`, `recipes of ROOM`, `api NAME`."""
     markdown = _INCLUDE.sub(lambda found: included(found[1], found[2], page.file.src_uri), markdown)
-    if page.file.src_uri.startswith("results/tables/"):
-        markdown += table_images(page.file.src_uri)
-        page.meta["search"] = {"boost": 0.2}  # a table has every word of a method's or scene's name
     markdown = _NOTEBOOK.sub(lambda found: notebook(ROOT / found[1]), markdown)
     markdown = _RECIPES.sub(lambda found: recipe_table(found[1]), markdown)
     markdown = _NAMES.sub(lambda found: name_table(found[1]), markdown)
@@ -119,13 +116,6 @@ def notebook(path: Path) -> str:
         if lines:
             parts.append("```text\n" + _ANSI.sub("", "\n".join(lines)) + "\n```")
     return "\n\n".join(parts)
-
-
-def table_images(page: str) -> str:
-    """Return a section with the images in the folder of a table's page: the plots, then a sheet for each scene."""
-    files = [f for f in sorted((ROOT / "docs" / page).parent.iterdir()) if f.suffix in (".webp", ".png")]
-    shown = [f"### {f.stem.replace('_', ' ').capitalize()}\n\n[![{f.stem}]({f.name})]({f.name})\n" for f in files]
-    return "\n".join(["\n\n## Images\n\nSelect an image to see it in full size.\n", *shown]) if shown else ""
 
 
 def recipe_table(room: str) -> str:
