@@ -26,8 +26,9 @@ from spike4dgs.baselines.tracking.fit import TRACKING
 from spike4dgs.benchmark.method import Method, Recipe
 from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.method import recipes as ours
-from spike4dgs.method.fit import FLAT_FIELD, Parts, RecipeMethod
+from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.recipes import FLAT, MSDI_SETTINGS
+from spike4dgs.method.settings import FLAT_FIELD
 from spike4dgs.method.starts.base import Initialization
 from spike4dgs.method.tuned import read_tuned, tuned
 

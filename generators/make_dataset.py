@@ -83,6 +83,10 @@ class SceneSettings:
         if not ticks >= 2 * TARGET_EVERY or abs(ticks / TARGET_EVERY - round(ticks / TARGET_EVERY)) > 1e-6:
             expected, fix = f"whole milliseconds, from 0.002 to {_MOST_SECONDS:g}", "give seconds such as 0.02"
             raise problem("--seconds", expected, str(self.seconds), fix)
+        physics = self.physics.physics()
+        if physics.moves_array and self.rendering == "split":
+            expected, fix = "an array that stands still", "make it with --rendering paths"
+            raise problem("--rendering split", expected, "--array-motion or --array-rotation", fix)
         return Job(
             world,
             self.variant,
@@ -96,7 +100,7 @@ class SceneSettings:
             adaptive=self.adaptive_keys,
             sub_ticks=self.sub_ticks,
             whole_frames=self.whole_frames,
-            physics=self.physics.physics(),
+            physics=physics,
         )
 
 
@@ -154,6 +158,10 @@ def make_dataset(
                 raise problem("--rendering split", expected, job.world, "make it with --rendering paths")
             for camera in cameras_of(job):
                 check_lens(camera, "--lens")
+        for job in todo:
+            if job.physics.moves_array and world_of(job).flash:
+                fix = "leave out --array-motion and --array-rotation"
+                raise problem("an array that moves", "a world in steady light", job.world, fix)
     with executor(workers, scheduler) as run:
         making = partial(_make, run=run, in_process=workers == 1 and scheduler is None, console=console)
         for number, job in enumerate(todo, start=1):

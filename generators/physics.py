@@ -53,6 +53,8 @@ class Physics:
         light: share of the light that reaches the sensors, in the clip and at calibration, as of a stopped-down lens.
         lost_ticks: share of a clip's ticks that each camera loses; the scene lists them as gaps.
         speed: of all motion, in units of the world's own.
+        array_motion: speed of the whole array along its path, m/s; see `rig.ArrayPath`.
+        array_rotation: angular speed of the whole array, degrees/s.
         noisy_others: frame and event cameras have noise, see `other_sensors`; spikes and truth stay the same.
     """
 
@@ -73,6 +75,8 @@ class Physics:
     light: float = 1.0
     lost_ticks: float = 0.0
     speed: float = 1.0
+    array_motion: float = 0.0
+    array_rotation: float = 0.0
     noisy_others: bool = False
 
     @property
@@ -101,6 +105,11 @@ class Physics:
         """True where methods are given other poses than the true ones."""
         return self.pose_noise_deg > 0 or self.pose_noise_m > 0
 
+    @property
+    def moves_array(self) -> bool:
+        """True where the array moves during the clip."""
+        return self.array_motion > 0 or self.array_rotation > 0
+
 
 _WORDS = {
     "lens": "lens",
@@ -117,6 +126,8 @@ _WORDS = {
     "light": "light",
     "lost_ticks": "lost",
     "speed": "speed",
+    "array_motion": "arraymotion",
+    "array_rotation": "arrayrotation",
     "noisy_others": "others",
 }
 
@@ -165,6 +176,9 @@ class PhysicsOptions:
         lost_ticks: Share of the clip's ticks that each camera loses, such as 0.05. The scene lists them as gaps:
             commands that read it need --allow-gaps.
         speed: Speed of all motion in units of the world's own, such as 2. The scene's id says how much: -speed2.
+        array_motion: Speed in metres per second of the whole array, which moves along an arc, as on a vehicle or in a
+            hand. The cameras of the scene stay those of the array: all that they see moves against them.
+        array_rotation: Angular speed in degrees per second with which the whole array turns about its middle camera.
         noisy_others: Give the frame cameras shot and read noise, and the event cameras unequal thresholds, shot events
             and a refractory period, as published; spikes and truth do not change.
     """
@@ -187,6 +201,8 @@ class PhysicsOptions:
     light: float | None = None
     lost_ticks: float | None = None
     speed: float | None = None
+    array_motion: float | None = None
+    array_rotation: float | None = None
     noisy_others: bool = False
 
     def physics(self) -> Physics:
@@ -227,6 +243,8 @@ _RANGES: dict[str, tuple[str, float, float]] = {  # what it is, from, to
     "light": ("a share from 1/1024 to 16", 1 / 1024, 16),
     "lost_ticks": ("a share from 0 to 0.5", 0, 0.5),
     "speed": ("a factor from 1/64 to 16", 1 / 64, 16),
+    "array_motion": ("metres per second from 0 to 100", 0, 100),
+    "array_rotation": ("degrees per second from 0 to 1000", 0, 1000),
 }
 
 

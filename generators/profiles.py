@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -55,6 +56,12 @@ class Profile:
     sparse_every: int  # ticks between the ground-truth frames of the cameras that are not held out
     soft: SplitSampling | None = None  # of key frames
     target_soft: SplitSampling | None = None  # of ground truth
+
+    @staticmethod
+    def from_settings(sampling: Mapping[str, Any]) -> Profile:
+        """Return the profile of `sampling` in `Job.settings`."""
+        soft = {name: SplitSampling(**sampling[name]) for name in ("soft", "target_soft") if name in sampling}
+        return Profile(**{**sampling, **soft, "views": tuple(sampling["views"])})
 
 
 _ALL = tuple(range(9))

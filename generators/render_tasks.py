@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.physics import from_settings, true_cameras
-from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile, SplitSampling
+from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
 from spike4dgs.generators.rendering.keyframes import read_arrays, write_arrays
 from spike4dgs.generators.rendering.lights.layers import Renderer, path_renderer
 from spike4dgs.generators.rendering.like_surfaces import join_soft
 from spike4dgs.generators.rendering.render import SoftStatic, StaticViews, anchor_s
-from spike4dgs.generators.rig import cameras
+from spike4dgs.generators.rig import ArrayPath, array_path, cameras
 from spike4dgs.generators.worlds import WORLDS, WorldScene, build_at
 
 _POINTS_PER_VIEW = 250  # of the sparse model
@@ -49,17 +49,12 @@ def recorded_job(source: Mapping[str, Any]) -> Job | None:
         source["variant"],
         int(source["seed"]),
         source["profile"],
-        _recorded_profile(source["sampling"]),
+        Profile.from_settings(source["sampling"]),
         source["seconds"],
         adaptive=source.get("adaptive_keys", True),
         physics=from_settings(source.get("physics", {})),
         **{name: source[name] for name in same if name in source},
     )
-
-
-def _recorded_profile(sampling: Mapping[str, Any]) -> Profile:
-    soft = {name: SplitSampling(**sampling[name]) for name in ("soft", "target_soft") if name in sampling}
-    return Profile(**{**sampling, **soft, "views": tuple(sampling["views"])})
 
 
 @lru_cache(maxsize=1)
@@ -78,8 +73,14 @@ def cameras_of(job: Job) -> tuple[Camera, ...]:
 @lru_cache(maxsize=1)
 def plan_of(job: Job) -> KeyPlan:
     """Return the plan of a job: which pixels are rendered at which ticks."""
-    motion = {"adaptive": job.adaptive, "sub_ticks": job.sub_ticks}
-    return key_plan(world_of(job), cameras_of(job), job.n_ticks, RATE_HZ, job.profile.max_key_px, **motion)
+    args = world_of(job), cameras_of(job), job.n_ticks, RATE_HZ, job.profile.max_key_px
+    return key_plan(*args, adaptive=job.adaptive, sub_ticks=job.sub_ticks, path=path_of(job))
+
+
+@lru_cache(maxsize=1)
+def path_of(job: Job) -> ArrayPath | None:
+    """Return the path of a job's array; None where it stands still."""
+    return array_path(world_of(job).rig, job.physics, [job.seed, job.variant, *job.world.encode()])
 
 
 def held_out_view(job: Job) -> int:
@@ -215,14 +216,7 @@ class RenderTargets(_Task):
         return [Truth(view, tick, *one) for view, *one in zip(views, *images, strict=True)]
 
 
-def renderer_of(
-    job: Job,
-    views: Sequence[Camera],
-    *,
-    truth: bool,
-    seed: int | None = None,
-    **others: Any,
-) -> Renderer:
+def renderer_of(job: Job, views: Sequence[Camera], *, truth: bool, seed: int | None = None, **others: Any) -> Renderer:
     """Return the renderer of streams or of ground truth, of no common random number. `others` go to the renderer."""
     p = job.profile
     own = {
@@ -234,7 +228,8 @@ def renderer_of(
         "psf_px": job.physics.psf_px,
     } | others
     if (soft := p.target_soft if truth else p.soft) is None:
-        return path_renderer(world_of(job), views, **{k: v for k, v in own.items() if k not in _OF_SPLIT})
+        own = {k: v for k, v in own.items() if k not in _OF_SPLIT} | {"path": path_of(job)}
+        return path_renderer(world_of(job), views, **own)
     from spike4dgs.generators.rendering.split_render import SplitRenderer  # it needs compiled kernels
 
     anchors_s = anchor_s(world_of(job), cameras_of(job), soft.anchor_px)
@@ -281,9 +276,8 @@ def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: 
                 write_arrays(files[k], {f"{number}": a for number, a in enumerate(arrays)})
                 yield k
 
-        if missing:
-            for _ in watch(stage, steps(), len(missing)):
-                pass
+        for _ in watch(stage, steps(), len(missing)) if missing else ():
+            pass
         return [tuple(read_arrays(file).values()) for file in files]
 
     which = "background of the truth" if truth else "background"
@@ -291,8 +285,8 @@ def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: 
     if sampling is not None:
         soft = join_soft(rendered(RenderSoft(job, truth), f"soft {which}"), cameras, sampling.sigma_px)
     own = other is None or soft is not None
-    found = rendered(RenderStatic(job, truth, own, soft), which)
-    images = [(a := np.concatenate(parts)).reshape(*shape, *a.shape[1:]) for parts in zip(*found, strict=True)]
+    found = zip(*rendered(RenderStatic(job, truth, own, soft), which), strict=True)
+    images = [(a := np.concatenate(parts)).reshape(*shape, *a.shape[1:]) for parts in found]
     if soft is not None:
         return StaticViews(images[0], images[0], soft, images[1])
     if other is None:

@@ -34,7 +34,7 @@ from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators import render_tasks, streams
 from spike4dgs.generators.physics import given_cameras
 from spike4dgs.generators.previews import contact_sheet, preview
-from spike4dgs.generators.profiles import RATE_HZ, Job
+from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore, read_arrays, write_arrays
 from spike4dgs.generators.rendering.lights.layers import key_store
@@ -222,6 +222,10 @@ class Maker:
         cameras = given_cameras(self.cameras, held_out, job.physics, [job.seed, job.variant, *job.world.encode()])
         if job.physics.moves_poses:
             write_json(self._scene / "truth/cameras.json", {c.id: to_nerfstudio(c) for c in self.cameras})
+        if path := render_tasks.path_of(job):
+            write_json(
+                self._scene / "truth/array_path.json", path.described(range(0, job.n_ticks + 1, TARGET_EVERY), RATE_HZ)
+            )
         scored = {c for split in splits.values() for c in split.test}
         finish_scene(
             self._scene,

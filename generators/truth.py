@@ -25,12 +25,14 @@ from scipy.ndimage import binary_dilation, binary_opening
 from spike4dgs.benchmark.scene.images import gray, read_exr, read_mask, write_exr, write_geometry, write_mask
 from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
-from spike4dgs.generators.render_tasks import Truth, cameras_of, held_out_view, renderer_of, world_of
+from spike4dgs.generators.render_tasks import Truth, cameras_of, held_out_view, path_of, renderer_of, world_of
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
+from spike4dgs.generators.rendering.moving_array.renderer import MovingArrayRenderer, along
 from spike4dgs.generators.rendering.render import MultiViewRenderer
 from spike4dgs.generators.second_renderings import second_truth
 
+WholePaths = MultiViewRenderer | MovingArrayRenderer
 _MASK_GROW_PX = 2
 _MASK_CHANGE = 0.1  # relative change of radiance that counts as moving light
 
@@ -97,7 +99,7 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
     views = sorted([held_out, *(int(v) for v in others)])
     p = job.profile
     chosen = [cameras_of(job)[v] for v in views]
-    some = MultiViewRenderer(world_of(job), chosen, seed=job.seed + 2, spp=p.spp, background_spp=p.spp)
+    some = along(path_of(job))(world_of(job), chosen, seed=job.seed + 2, spp=p.spp, background_spp=p.spp)
     rendered = _reference(job, some, _MORE * p.spp)
     seen = []
     for tick in ticks:
@@ -106,7 +108,7 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
             found = errors(store.radiance(view, plan, tick), image, mask)
             seen.append({"tick": tick, "camera": cameras_of(job)[view].id, "is_key": tick in plan.ticks} | found)
     camera = cameras_of(job)[held_out]
-    one = MultiViewRenderer(world_of(job), [camera], seed=job.seed + 3, spp=p.spp, background_spp=p.spp)
+    one = along(path_of(job))(world_of(job), [camera], seed=job.seed + 3, spp=p.spp, background_spp=p.spp)
     rendered = _reference(job, one, _MORE * p.target_spp)
     frames = []
     for tick in job.target_ticks[:: max(1, len(job.target_ticks) // _FRAMES)][:_FRAMES]:
@@ -122,7 +124,7 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
     }
 
 
-def _reference(job: Job, renderer: MultiViewRenderer, spp: int) -> Callable[[float], NDArray[np.float32]]:
+def _reference(job: Job, renderer: WholePaths, spp: int) -> Callable[[float], NDArray[np.float32]]:
     """Return what renders the views of `renderer` whole at a time, with `spp` whole paths a pixel.
 
     By Mitsuba's own loop for pinholes. It knows neither our lenses nor our blur: there every pixel is traced by ours.
@@ -132,9 +134,10 @@ def _reference(job: Job, renderer: MultiViewRenderer, spp: int) -> Callable[[flo
     world = renderer.world
     own: dict[str, Any] = {"spp": spp, "background_spp": spp, "psf_px": job.physics.psf_px}
 
-    def loaded(t_s: float) -> MultiViewRenderer:
+    def loaded(t_s: float) -> WholePaths:
         seed = job.seed + _SEEDS[0]
-        return MultiViewRenderer(world.at_brightness(t_s), renderer.cameras, seed=seed, whole_frames=True, **own)
+        make = along(path_of(job))
+        return make(world.at_brightness(t_s), renderer.cameras, seed=seed, whole_frames=True, **own)
 
     if world.flash:
         return lambda t_s: loaded(t_s).reference_frames(t_s, spp) if ideal else loaded(t_s).crn_frames(t_s)

@@ -32,7 +32,7 @@ from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.pose_refinement import REFINEMENT
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.self_calibration.from_clip import as_in_clip
-from spike4dgs.method.settings import Settings, SettingsByPart, as_dict, override, scaled
+from spike4dgs.method.settings import FLAT_FIELD, Settings, SettingsByPart, as_dict, follow_images, override, scaled
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest, at_most, measure
 from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.torch_state import check_device, kept_random_state, seeded
@@ -43,7 +43,6 @@ from spike4dgs.method.training_views.warm_up_scene import warm_up_scene
 from spike4dgs.method.tuned import is_tuned
 
 T = TypeVar("T")
-FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +108,9 @@ class RecipeMethod(Shown):
             defaults["image_maker"] = self.images.settings
         found = override(defaults, recipe.settings, f"recipe {recipe.name}")
         self.settings = follow_images(found, recipe.settings)
+        if recipe.motion in parts.algorithms and getattr(self.settings["initialization"], "follow_array", False):
+            expected, fix = "a motion of the trainer", "leave initialization.follow_array out"
+            raise problem(f"recipe {self.name}", expected, recipe.motion, fix)
         self.params: dict[str, Any] = {**recipe.as_dict(), "settings": as_dict(self.settings)}
         self.rasterizes = self.algorithm.rasterizes
         posed = self.initialization.estimates_poses
@@ -235,16 +237,6 @@ def describe(recipe: Recipe, parts: Parts, algorithm: Algorithm) -> str:
     return "; ".join(filter(None, (motion, made, loss, start, searched)))
 
 
-def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:
-    """Return settings whose initialisation corrects images where the fit's are corrected, unless overridden."""
-    first = settings["initialization"]
-    has = any(f.name == FLAT_FIELD for f in fields(first))
-    if not has or f"initialization.{FLAT_FIELD}" in overrides:
-        return dict(settings)
-    images: Any = settings["images"]
-    return {**settings, "initialization": replace(first, **{FLAT_FIELD: images.flat_field})}
-
-
 def trainer_algorithm(recipe: Recipe, parts: Parts) -> Algorithm:
     """Return the one trainer, with the recipe's motion and supervision."""
     motion = _part(parts.motion, recipe, "motion")
@@ -275,8 +267,8 @@ def fit_gaussians(
     initial = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
     first = motion.initialize(from_points(points, values, **initial, device=request.device), job.training_images)
     loss = supervise(job.settings["supervision"], job.scene).to(request.device)
-    scale = job.extent.scale
-    trainer = Trainer(job.training_images, first, motion, loss, settings, density, scale=scale, seed=request.seed)
+    own: Any = {"scale": job.extent.scale, "seed": request.seed, "path": start.path}
+    trainer = Trainer(job.training_images, first, motion, loss, settings, density, **own)
     trainer.run(request.progress, request.checkpoint, job.key)
     return FittedModel(
         pieces=trainer.pieces(),
@@ -289,6 +281,7 @@ def fit_gaussians(
         pixel_filter=settings.pixel_filter,
         estimates=trainer.supervision.estimates(),
         light=None if job.light is None else torch.tensor(job.light.factors, dtype=torch.float32),
+        path=start.path,
     )
 
 

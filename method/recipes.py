@@ -122,6 +122,7 @@ SPIKE4DGS_X = Recipe(
         **_PATHS,
         # Corrected means of a clip have hardly any noise: a road's grain is enough to find its depth.
         "initialization.noise": 3e-5,
+        "initialization.follow_array": True,
         "supervision.huber_delta": 0.02,  # a span's noise, off by up to a spike: the median of few is one of them
     },
 )

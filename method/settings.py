@@ -23,6 +23,7 @@ class Settings:
         return self
 
 
+FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
 SettingsByPart = Mapping[str, Settings]
 S = TypeVar("S", bound=Settings)
 
@@ -59,6 +60,16 @@ def make_settings(overrides: Mapping[str, Any], where: str, defaults: S, prefix:
 def scaled(parts: SettingsByPart, scale: float) -> dict[str, Settings]:
     """Return the settings of all parts with the step counts multiplied by a budget's scale."""
     return {part: settings.scaled(scale) for part, settings in parts.items()}
+
+
+def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:
+    """Return settings whose initialisation corrects images where the fit's are corrected, unless overridden."""
+    first = settings["initialization"]
+    has = any(f.name == FLAT_FIELD for f in fields(first))
+    if not has or f"initialization.{FLAT_FIELD}" in overrides:
+        return dict(settings)
+    images: Any = settings["images"]
+    return {**settings, "initialization": replace(first, **{FLAT_FIELD: images.flat_field})}
 
 
 def as_dict(parts: SettingsByPart) -> dict[str, dict[str, Any]]:

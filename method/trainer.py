@@ -16,6 +16,7 @@ from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import Progress
+from spike4dgs.method.array_path import ArrayPath
 from spike4dgs.method.checkpoint import Checkpoint, run_steps
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.optimizer import (
@@ -43,7 +44,11 @@ from spike4dgs.method.training_views.training_images import TrainingImages
 
 
 class Trainer:
-    """A fit in progress. `scale` is the scene's size in metres, which relates learning rates to the world."""
+    """A fit in progress. `scale` is the scene's size in metres, which relates learning rates to the world.
+
+    Where the array moves along a `path`, Gaussians are those of the world, and nothing is a background: no pixel of
+    the array shows the same thing for long.
+    """
 
     def __init__(
         self,
@@ -56,6 +61,7 @@ class Trainer:
         *,
         scale: float,
         seed: int,
+        path: ArrayPath | None = None,
     ) -> None:
         if settings.refine_poses and (settings.freeze_background or images.spans is not None):
             expected = "either trainer.refine_poses, or trainer.freeze_background and images of known spans"
@@ -65,7 +71,7 @@ class Trainer:
             expected = f"trainer.average of at most {1 - stop:g}, as density.refine_stop is {stop:g}"
             raise problem("settings", expected, f"{settings.average:g}", "average fewer steps")
         self.training_images, self.motion, self.supervision = images, motion, supervision
-        self.settings, self.density, self.scale, self.seed = settings, density, scale, seed
+        self.settings, self.density, self.scale, self.seed, self.path = settings, density, scale, seed, path
         self.plan = stages(settings, motion.moves, motion.rests_first, motion.pieces)
         self.total = sum(s.steps for s in self.plan)
         self.step = 0
@@ -111,7 +117,7 @@ class Trainer:
     def _continue(self, stage: Stage) -> None:
         """Go over to a stage: static Gaussians become a background, or a piece of the clip ends and another begins."""
         if stage.neighbour is None:
-            if stage.deforms and self.settings.freeze_background:
+            if stage.deforms and self.settings.freeze_background and not self.path:
                 self._freeze()
             return
         self.ended[self.plan[self.plan.index(stage) - 1].piece] = self.gaussians.detached()
@@ -160,7 +166,7 @@ class Trainer:
 
         def render_at(t: float) -> Tensor:
             splats = self.motion.splats(self.gaussians, stage.within(t)) if stage.deforms else self.gaussians.splats()
-            outputs.append(self._image(splats, chosen, views))
+            outputs.append(self._image(self._seen(splats, t), chosen, views))
             return self._gray(outputs[-1].image, views, stage, t)
 
         set_learning_rates(self.adam, self.learning_rates, stage.fraction(self.step))
@@ -197,7 +203,7 @@ class Trainer:
         def around(index: int) -> RenderViews:
             def render_views(ticks: float, chosen: Sequence[int]) -> Tensor:
                 at, views = (training.ticks[index] + ticks) / training.n_ticks, training.views.some(chosen)
-                splats = fit.motion.splats(snapshot, stage.within(at))
+                splats = fit._seen(fit.motion.splats(snapshot, stage.within(at)), at)
                 return fit._gray(fit._image(splats, chosen, views).image, views, stage, at)
 
             return render_views
@@ -211,6 +217,10 @@ class Trainer:
         """Stop what works beside the fit's own thread."""
         if self.corrections:
             self.corrections.stop()
+
+    def _seen(self, splats: Splats, t: float) -> Splats:
+        """Return splats as they are in the frame of the array at t in [0, 1] of the clip."""
+        return self.path.carried(splats, t) if self.path else splats
 
     def _image(self, splats: Splats, chosen: Sequence[int], views: Views) -> RenderOutput:
         """Render into the chosen views, over the background where there is one."""

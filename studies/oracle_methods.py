@@ -25,12 +25,13 @@ from spike4dgs.benchmark.method import FitRequest, Method, Model, find_methods
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.fit import FLAT_FIELD, RecipeMethod
+from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.training import choose_ticks
 from spike4dgs.method.motion.base import Motion
 from spike4dgs.method.motion.paths import Paths
+from spike4dgs.method.settings import FLAT_FIELD
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest
 from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.starts.rig import Cloud, CloudSettings, cells_of, filled

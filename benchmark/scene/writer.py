@@ -216,6 +216,8 @@ _CONTENTS = {
     "  counts, `.npz`.",
     "calibration/maps": "`calibration/maps/CAMERA.npz`: gain (mean 1) and dark rate (spikes per tick) as measured.",
     "truth": "`truth/CAMERA.npz`: the sensor's true gain and dark maps. Only for scoring a calibration.",
+    "truth/array_path.json": "`truth/array_path.json`: transforms to the world that stands still from the frame of\n"
+    "  the array, in which the cameras are given.",
     "truth/cameras.json": "`truth/cameras.json`: the true cameras; the poses that methods are given differ from them.",
     "conventional": "`conventional/CAMERA/TICK.png`: what a frame camera sees, 8-bit sRGB, exposed from this tick on.",
     "events": "`events/CAMERA.npz`: an event camera: t (us), x, y (row 0 at the top), p (1: brighter, 0: darker).",

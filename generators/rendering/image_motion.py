@@ -10,31 +10,49 @@ import numpy as np
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.rendering.mitsuba_scene import Hits
+from spike4dgs.generators.rig import ArrayPath
 from spike4dgs.generators.worlds import WorldScene
 
 _STEP_S = 1e-6  # short against every motion here, long against float64 round-off of metres
 COARSE_PX = 2.5  # largest motion between two coarse keys; `visibility` grows moving objects by more, 3 px
 _MOST_SUB_TICKS = 8
+_GRID = 9  # points each way
 
 
-def max_image_speed(world: WorldScene, cameras: Sequence[Camera], duration_s: float, samples: int = 33) -> float:
+def max_image_speed(
+    world: WorldScene,
+    cameras: Sequence[Camera],
+    duration_s: float,
+    samples: int = 33,
+    path: ArrayPath | None = None,
+) -> float:
     """Return the speed in px/s of the fastest visible image point over all views and `samples` times of the clip.
 
     Exact from geometry: every vertex of the moving meshes is projected at t and a microsecond later, rotation included.
     Occlusion is ignored, so the result is an upper bound, reached wherever that vertex is visible. Images in mirrors
-    and panes count as visible too.
+    and panes count as visible too. Where the array moves along a `path`, so does what stands still at the near end of
+    the world's depth range.
     """
     fastest = 0.0
     for t in np.linspace(0.0, duration_s, samples):
         points = world.moving_points(t), world.moving_points(t + _STEP_S)
         before, after = (np.concatenate([p, *(mirrored(p, plane) for plane in world.mirrors)]) for p in points)
-        for camera in cameras:
-            uv, z = camera.project(before)
-            uv_after, _ = camera.project(after)
+        now, then = (path.posed(cameras, at) if path else cameras for at in (t, t + _STEP_S))
+        for camera, later in zip(now, then, strict=True):
+            near = _near_points(camera, world.depth_range[0]) if path else before[:0]
+            uv, z = camera.project(np.concatenate([before, near]))
+            uv_after, _ = later.project(np.concatenate([after, near]))
             seen = (z > 0) & (uv > 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
             speed = np.linalg.norm(uv_after - uv, axis=1)[seen] / _STEP_S
             fastest = max(fastest, float(speed.max(initial=0.0)))
     return fastest
+
+
+def _near_points(camera: Camera, z: float) -> np.ndarray:
+    """Return points [N, 3] at a depth, all over a camera's image."""
+    shares = np.linspace(0.01, 0.99, _GRID)
+    u, v = (g.ravel() for g in np.meshgrid(shares * camera.width, shares * camera.height))
+    return camera.unproject(np.stack([u, v], axis=1), np.full(len(u), z))
 
 
 def mirrored(points: np.ndarray, planes: np.ndarray) -> np.ndarray:
@@ -109,6 +127,7 @@ def key_plan(
     *,
     adaptive: bool = True,
     sub_ticks: bool = True,
+    path: ArrayPath | None = None,
 ) -> KeyPlan:
     """Return the plan for a clip, from the exact image motion of the world's geometry.
 
@@ -122,8 +141,9 @@ def key_plan(
         max_px: largest motion of an image point between two of its keys.
         adaptive: False renders every changing pixel at every tick: slow and exact.
         sub_ticks: False never renders instants inside a tick.
+        path: the motion of the array; None: it stands still.
     """
-    speed = max_image_speed(world, cameras, n_ticks / rate_hz)
+    speed = max_image_speed(world, cameras, n_ticks / rate_hz, path=path)
     chain = spacings(speed, n_ticks, rate_hz, max_px) if adaptive else (1,)
     instants = 1
     while chain[-1] == 1 and sub_ticks and instants < min(speed / rate_hz / max_px, _MOST_SUB_TICKS):

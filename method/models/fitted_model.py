@@ -19,6 +19,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.screen.shown import Shown
 from spike4dgs.benchmark.untrusted import MAX_LENGTH, MAX_SIDE, MAX_TICKS, number, positive, shown, whole
+from spike4dgs.method.array_path import ArrayPath
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.model_file import (
     BACKGROUND,
@@ -131,6 +132,7 @@ class FittedModel(GaussianModel):
     pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
     estimates: Mapping[str, Tensor] = field(default_factory=dict)  # the supervision's, beside the scene; not saved
     light: Tensor | None = None  # factors of all light, or of the lamp's layer, over equal parts of the clip [n]
+    path: ArrayPath | None = None  # of the array, in whose frame cameras are, through the Gaussians' world
 
     def _about(self) -> str:
         moving = ", ".join(str(len(g)) for g in self.pieces)
@@ -150,7 +152,7 @@ class FittedModel(GaussianModel):
 
     def _render(self, view: Views, t_us: float) -> Tensor:
         """Render one view [1, H, W]; the same bits with the background kept from an earlier time as without."""
-        still = self._repeated.in_view(view) if len(self.background) else None
+        still = self._repeated.in_view(view) if len(self.background) and not self.path else None
         if still is None:
             channels = render(self._all(t_us), view, self.pixel_filter).image
         else:
@@ -172,7 +174,7 @@ class FittedModel(GaussianModel):
         return factor_at(self.light.double().cpu().numpy(), t_us / self.duration_us)
 
     def splats(self, t_us: float) -> Splats:
-        """Return what is rendered at `t_us`; a lamp's layer is in the gray values."""
+        """Return what is rendered at `t_us`, in the frame of the array; a lamp's layer is in the gray values."""
         splats = self._all(t_us)
         if not self._layered:
             return splats
@@ -180,10 +182,15 @@ class FittedModel(GaussianModel):
 
     def _all(self, t_us: float) -> Splats:
         moving = self._moving(t_us)
-        return join(self._repeated.splats, moving) if len(self.background) else moving
+        splats = join(self._repeated.splats, moving) if len(self.background) else moving
+        return self.path.carried(splats, self._share(t_us)) if self.path else splats
+
+    def _share(self, t_us: float) -> float:
+        """Return a time in [0, 1] of the clip."""
+        return min(max(t_us / self.duration_us, 0.0), 1.0)
 
     def _moving(self, t_us: float) -> Splats:
-        t, count = min(max(t_us / self.duration_us, 0.0), 1.0), len(self.pieces)
+        t, count = self._share(t_us), len(self.pieces)
         piece = min(int(t * count), count - 1)
         return self.motion.splats(self.pieces[piece], t * count - piece)
 
@@ -200,7 +207,8 @@ class FittedModel(GaussianModel):
         pieces = {f"piece{i}": to_file_names(g.tensors()) for i, g in enumerate(self.pieces)}
         background = {BACKGROUND: to_file_names(self.background.tensors())}
         light = {} if self.light is None else {"light": {"factors": self.light}}
-        tensors = group(**pieces, **background, motion=self.motion.state_dict(), **light)
+        own = {} if self.path is None else {"path": self.path.tensors()}
+        tensors = group(**pieces, **background, motion=self.motion.state_dict(), **light, **own)
         config = {"motion": self.spec.as_dict(), "pieces": len(pieces), "filter": asdict(self.pixel_filter)}
         write_model(path, ModelFile(self.KIND, config, tensors, provenance))
 
@@ -221,9 +229,9 @@ class FittedModel(GaussianModel):
         )
         duration_us, found = file.provenance.duration_us, _filter(file.config.get("filter", {}))
         light = _light(file.part("light"))
-        made = cls(
-            tuple(pieces), background, motion.to(device), duration_us, device, spec, pixel_filter=found, light=light
-        )
+        path = ArrayPath.from_tensors(tensors) if (tensors := file.part("path")) else None
+        own: dict[str, Any] = {"pixel_filter": found, "light": light, "path": path}
+        made = cls(tuple(pieces), background, motion.to(device), duration_us, device, spec, **own)
         made.splats(0.0)  # else a tensor that the motion lacks would only be missed at the first render
         return made
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.array_path import ArrayPath
 from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.settings import Settings
@@ -26,6 +27,7 @@ class Start:
     cameras: tuple[Camera, ...]
     points: Float32  # [N, 3] m
     values: Float32  # [N] gray radiance
+    path: ArrayPath | None = None  # by which the array moves through the world that the points are of; None: it stands
 
 
 @dataclass(frozen=True, eq=False)

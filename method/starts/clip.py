@@ -53,6 +53,10 @@ class SpikeClip:
         """Return the number of windows."""
         return len(self.windows)
 
+    def time(self, window: int) -> float:
+        """Return the middle of a window as a time in [0, 1] of the clip."""
+        return sum(self.windows[window]) / 2 / self.scene.n_ticks
+
     def mean(self, window: int | None = None) -> Float32:
         """Return a mean; see `Clip`."""
         start, stop = (0, self.scene.n_ticks) if window is None else self.windows[window]

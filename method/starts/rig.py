@@ -4,14 +4,18 @@ Static pixels are matched on the mean of the whole clip, where the spikes' quant
 that change are matched on short windows: all of them at the middle of the clip, where the trainer begins, and at both
 ends those that are quiet just then, which is the background that something moving hides in the middle.
 
+With `follow_array` the clip tells whether the array moves (`array_motion`). Where it does, all points are of short
+windows, in the frame of the world, with the array's path.
+
 With `flat_field` every image is corrected by its camera's calibrated gain and dark rate, where a scene has them. A
 recipe of other sensors has their images in the place of spikes (`clip`).
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +27,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.settings import Settings
+from spike4dgs.method.starts.array_motion import find_path, may_move
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.clip import Clip, ImageClip, SpikeClip
 from spike4dgs.method.starts.plane_sweep import (
@@ -62,6 +67,8 @@ class RigSettings(PointSettings):
     """Numbers of `rig` (prefix `initialization`)."""
 
     flat_field: bool = False  # correct images by each camera's calibration, if known
+    follow_array: bool = False  # find whether the array moves, and its path; the trainer fits in the world's frame
+    window_noise: float = 4e-4  # variance of the noise of a window's image, where nothing else can be matched
 
 
 DEFAULTS = RigSettings()
@@ -81,8 +88,48 @@ def rig(scene: TrainingScene, settings: RigSettings = DEFAULTS, recorded: Record
     Raises UserError where all cameras have one centre.
     """
     length = settings.window_ticks
-    clip = ImageClip(scene, recorded, length) if recorded else SpikeClip(scene, length, settings.flat_field)
-    return swept(scene, settings, clip)
+    if recorded:
+        return swept(scene, settings, ImageClip(scene, recorded, length))
+    clip = SpikeClip(scene, length, settings.flat_field)
+    return (moving(scene, settings, clip) if settings.follow_array else None) or swept(scene, settings, clip)
+
+
+def moving(scene: TrainingScene, settings: RigSettings, clip: SpikeClip) -> Start | None:
+    """Return the first points in the world through which the array moves, and its path, and say so on stderr.
+
+    They are of the middle window and, where that sees none, of the first and the last. None: the array stands still.
+    """
+    cameras, middle = scene.cameras, len(clip) // 2
+    apart = len(cameras) > 1 and widest_baseline(cameras) > 0 and looked_at(cameras) is None
+    if not apart or not may_move(clip.moving()):
+        return None
+    noisy, images = replace(settings, noise=max(settings.noise, settings.window_noise)), clip.mean(middle)
+    planes = find_range(cameras, images, noisy)
+    maps = sweep_all(cameras, images, planes, settings=noisy)
+    found = find_path(cameras, clip, maps, noisy)
+    if not found.believed:
+        return None
+    share = f"{found.share:.0%} of what tells it from an array that stands still"
+    print(f"{scene.id}: the array moves, the image by {found.motion_px:.1f} px: it explains {share}", file=sys.stderr)
+    every = [np.ones(image.shape, bool) for image in images]
+    seen = seen_pixels(scene) or every
+    cloud = thin(cameras, Cloud(*_points(cameras, maps, images, seen, noisy)), noisy)
+    for at in sorted({0, len(clip) - 1} - {middle}):
+        posed, there = found.path.posed(cameras, clip.time(at)), clip.mean(at)
+        points = _points(posed, sweep_all(posed, there, planes, settings=noisy), there, seen, noisy)
+        cloud = _joined(cameras, cloud, thin(cameras, Cloud(*points), noisy), noisy)
+    return replace(filled(scene, cloud, images, noisy), path=found.path)
+
+
+def _joined(cameras: Sequence[Camera], cloud: Cloud, more: Cloud, settings: CloudSettings) -> Cloud:
+    """Return a cloud and those points of another that are where the middle camera sees none of the first."""
+    camera = middle_camera(cameras)
+    if not len(cloud.points) or not len(more.points):
+        return more if not len(cloud.points) else cloud
+    distance, _ = cKDTree(camera.project(cloud.points)[0]).query(camera.project(more.points)[0])
+    new = distance > settings.hole_px
+    values = np.concatenate([cloud.values, more.values[new]])
+    return Cloud(np.concatenate([cloud.points, more.points[new]]), values)
 
 
 def swept(scene: TrainingScene, settings: PointSettings, clip: Clip) -> Start:

@@ -79,6 +79,8 @@ def test_an_option_replaces_that_of_the_named_camera():
         ({"light": 0.0}, "--light: expected a share from 1/1024 to 16"),
         ({"lost_ticks": 1.0}, "--lost-ticks"),
         ({"speed": 0.0}, "--speed"),
+        ({"array_motion": -1.0}, "--array-motion: expected metres per second"),
+        ({"array_rotation": 1e4}, "--array-rotation: expected degrees per second"),
     ],
 )
 def test_numbers_that_no_camera_has_are_one_line(options, words):
@@ -182,6 +184,21 @@ def test_twice_the_speed_is_the_same_motion_in_half_the_time(name):
     for t_s in (0.0, 0.0011, job.seconds):
         assert np.array_equal(fast.moving_points(t_s), slow.moving_points(2 * t_s))
     assert fast.duration_s == job.seconds and fast.object_names == slow.object_names
+
+
+def test_an_array_that_moves_is_recorded_beside_the_scene_and_changes_no_camera(ideal, tmp_path, monkeypatch):
+    render_fakes(monkeypatch)
+    made = job(array_motion=2.0, array_rotation=30.0)
+    scene = Maker(made, tmp_path, plain).make()
+    assert scene.name == "car-0-tiny-arraymotion-arrayrotation"
+    assert recorded_job(json.loads((scene / "scene.json").read_text())["source"]) == made
+    assert (scene / "transforms_all.json").read_bytes() == (ideal / "transforms_all.json").read_bytes()
+    told = json.loads((scene / "truth/array_path.json").read_text())
+    assert told["ticks"] == [0, 20, 40, 60, 80] and not (ideal / "truth/array_path.json").exists()
+    first, last = (np.array(told["array_to_world"][k]) for k in (0, -1))
+    np.testing.assert_array_equal(first, np.eye(4))
+    middle = np.array(world_of(made).rig.center)
+    assert np.linalg.norm(last[:3, :3] @ middle + last[:3, 3] - middle) == pytest.approx(2.0 * 0.004, rel=1e-3)
 
 
 def test_lost_ticks_are_zeros_that_the_scene_lists(ideal, tmp_path, monkeypatch):

@@ -20,7 +20,9 @@ from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import Clip, KeyStore
+from spike4dgs.generators.rendering.moving_array.renderer import MovingArrayRenderer, along
 from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
+from spike4dgs.generators.rig import ArrayPath
 from spike4dgs.generators.sensor.light import STEADY, FlickeringInstants, FlickeringMeans, Light
 from spike4dgs.generators.worlds import WorldScene
 from spike4dgs.generators.worlds.base import Flash
@@ -75,12 +77,14 @@ class LayeredRenderer:
         return np.asarray(steady + np.float32(self._flash.brightness(t_s)) * flashing)
 
 
-Renderer = MultiViewRenderer | LayeredRenderer
+Renderer = MultiViewRenderer | LayeredRenderer | MovingArrayRenderer
 
 
-def path_renderer(world: WorldScene, cameras: Sequence[Camera], **settings: Any) -> Renderer:
-    """Return the renderer of whole paths of a world."""
-    return (LayeredRenderer if world.flash else MultiViewRenderer)(world, cameras, **settings)
+def path_renderer(
+    world: WorldScene, cameras: Sequence[Camera], *, path: ArrayPath | None = None, **settings: Any
+) -> Renderer:
+    """Return the renderer of whole paths of a world; `path`: the motion of the array, in steady light."""
+    return (LayeredRenderer if world.flash else along(path))(world, cameras, **settings)
 
 
 class _Brightness:

@@ -12,6 +12,7 @@ import safetensors.torch
 import torch
 from dummy_methods import CountMethod, run
 from hard_case import HardCase
+from moving_world import MovingWorld
 from saved_models import DURATION_US, MODELS, WORLD, model, provenance
 from small_scenes import write_small_scene
 
@@ -112,6 +113,18 @@ def test_a_model_keeps_the_layer_of_a_lamp(tmp_path: Path) -> None:
         image = loaded.render(WORLD.held_out, share * DURATION_US)
         np.testing.assert_array_equal(image, lit.render(WORLD.held_out, share * DURATION_US))
         np.testing.assert_allclose(image, whole.render(WORLD.held_out, share * DURATION_US), rtol=1e-5, atol=1e-6)
+
+
+def test_a_model_keeps_the_path_of_the_array_and_renders_along_it(tmp_path: Path) -> None:
+    still, path = model("paths"), MovingWorld().path
+    fitted = dataclasses.replace(still, path=path)
+    fitted.save(tmp_path / "m", provenance())
+    loaded = load_model(tmp_path / "m").model
+    for share in (0.0, 0.5, 1.0, 1.0):
+        image = loaded.render(WORLD.held_out, share * DURATION_US)
+        np.testing.assert_array_equal(image, fitted.render(WORLD.held_out, share * DURATION_US))
+        posed = still.render(path.posed([WORLD.held_out], share)[0], share * DURATION_US)
+        assert abs(image - posed).max() < 1e-3
 
 
 @pytest.mark.parametrize("factors", [[[1.0]], [], [1.0, float("nan")], [-1.0]])

@@ -1,0 +1,1 @@
+"""Rendering for an array that moves."""
