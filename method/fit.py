@@ -166,8 +166,8 @@ class RecipeMethod(Shown):
             return
         check_device(request.device)
         request.progress(0, 1, "compilation")
-        scene, *points = warm_up_scene()
-        start = Start(scene.cameras, *points)
+        scene, points, values = warm_up_scene()
+        start = Start(scene.cameras, points, values)
         recorded = warm_up_images(scene) if isinstance(self.images, RecordedImages) else None
         quiet = FitRequest(device=request.device, progress=no_progress)
         with kept_random_state(request.device):

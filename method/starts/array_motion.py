@@ -179,11 +179,10 @@ def _with_slopes(image: Float32, blur: float) -> Float32:
 
 def _sampled(image: Float32, uv: Float64) -> Float64:
     """Return the values [N, F] of an image [H, W, F] at pixel coordinates [N, 2]; NaN outside."""
-    at = (uv - 0.5).astype(np.float32)[:, None]
+    across, down = (uv - 0.5).astype(np.float32).T[..., None]
     nothing = (np.nan,) * 4
-    return cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nothing)[
-        :, 0
-    ].astype(np.float64)
+    found = cv2.remap(image, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nothing)
+    return np.asarray(found[:, 0], np.float64)
 
 
 def _deviation(values: Float64) -> float:
