@@ -64,7 +64,7 @@ def test_a_release_that_was_edited_is_refused(tmp_path: Path) -> None:
         lambda r: r["tracks"]["a"]["scenes"].update(s=None),
         lambda r: r["tracks"]["a"].update(withheld=["everything"]),
         lambda r: r["ceilings_db"].update({f"s@{'0' * 12}": 1e9}),
-        lambda r: r["ceilings_db"].update(s=50.0),
+        lambda r: r["ceilings_db"].update({"s@0123": 50.0}),
     ],
 )
 def test_a_release_follows_its_schema(tmp_path: Path, change: Any) -> None:
