@@ -19,6 +19,7 @@ from spike4dgs.leaderboard.entry import add_line, entry_path, read_ledger
 from spike4dgs.leaderboard.page.rows import gather
 from spike4dgs.leaderboard.rank import make_boards, write_boards
 from spike4dgs.leaderboard.reading import FEWEST, read_all, read_briefs, read_checked
+from spike4dgs.leaderboard.thumbnails import KEY
 from spike4dgs.leaderboard.tracks import SHIPPED
 from spike4dgs.leaderboard.verify import verify_leaderboard
 
@@ -30,6 +31,7 @@ def add(board: Path, name: str) -> Path:
     (path,) = SHIPPED.glob("entries/*/tfp+static.json")
     entry = copy.deepcopy(json.loads(path.read_text(encoding="utf-8")))
     entry["record"]["method"]["name"] = name
+    del entry[KEY]  # its sheet stays where it is
     write_json(board / (own := entry_path(entry["record"])), entry)
     add_line(board, sha256_json(entry), own)
     return board / own
