@@ -276,8 +276,9 @@ def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: 
                 write_arrays(files[k], {f"{number}": a for number, a in enumerate(arrays)})
                 yield k
 
-        for _ in watch(stage, steps(), len(missing)) if missing else ():
-            pass
+        if missing:
+            for _ in watch(stage, steps(), len(missing)):
+                pass
         return [tuple(read_arrays(file).values()) for file in files]
 
     which = "background of the truth" if truth else "background"
