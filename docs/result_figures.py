@@ -24,8 +24,8 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.studies.results.blocks import NINE, of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
-from spike4dgs.studies.results.published import given_row
 from spike4dgs.studies.results.records import read_records
+from spike4dgs.studies.results.tables.published import given_row
 
 RECORDS = Path(__file__).parent.parent / "studies" / "results" / "records"
 SHOWN = (  # rows of a sheet: ours, the best tuned rival, and each kind of the paper's rows

@@ -17,7 +17,6 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.method import (
     DEFAULT_BUDGET,
-    DEFAULT_GIVEN,
     Method,
     choose_device_for,
     get_method,
@@ -32,6 +31,7 @@ from spike4dgs.benchmark.runs.record import Record
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.studies.kit.timing import markdown, write_csv
+from spike4dgs.studies.sensors import BITS_OF_A_PIXEL, BITS_OF_AN_EVENT, bits_per_second, sensors_of
 
 ROWS = (
     "rgb+4dgs",
@@ -45,8 +45,6 @@ ROWS = (
     "spike4dgs",
     "spike4dgs-x",
 )
-BITS_OF_A_PIXEL = 8  # of a frame; scenes hold 8-bit PNG
-BITS_OF_AN_EVENT = 64  # 4 bytes of address, 4 of time (libcaer, AEDAT); compressed codes take less
 MEAN = "mean"
 COLUMNS = {
     "bits_per_second": "Mbit/s of a camera",
@@ -56,7 +54,6 @@ COLUMNS = {
     "fit_seconds": "fit, s",
 }
 _DIGITS = {"psnr": 2, "psnr_dynamic": 2, "temporal_error": 4, "fit_seconds": 0}
-SPIKES = "spikes"
 Values = dict[str, float | None]  # by column
 
 
@@ -130,24 +127,6 @@ def compare(scenes: Sequence[Scene], methods: Sequence[Method], settings: Settin
     return rows
 
 
-def sensors_of(method: Method) -> tuple[str, ...]:
-    """Return the sensors that a method takes: of frames and events those that it is given, or spikes."""
-    given = getattr(method, "given", DEFAULT_GIVEN)
-    return tuple(kind for kind in ("frames", "events") if kind in given) or (SPIKES,)
-
-
-def bits_per_second(scene: Scene, sensor: str) -> float:
-    """Return what a camera of a kind sends: all of its pixels, or its events, measured on the training cameras."""
-    pixels = int(scene.meta["width"]) * int(scene.meta["height"])
-    if sensor == SPIKES:
-        return pixels * scene.rate_hz
-    training = scene.training
-    if sensor == "frames":
-        return pixels * BITS_OF_A_PIXEL * training.frames(training.cameras[0].id).fps
-    count = sum(len(training.events(camera.id)) for camera in training.cameras) / len(training.cameras)
-    return BITS_OF_AN_EVENT * count / (1e-6 * training.duration_us)
-
-
 def make_row(method: Method, scenes: Sequence[Scene], records: Sequence[Record]) -> Row:
     """Return the row of a method, each value the mean over the seeds in `records`."""
     sensors, mine = sensors_of(method), [r for r in records if r["method"]["name"] == method.name]
@@ -160,7 +139,7 @@ def make_row(method: Method, scenes: Sequence[Scene], records: Sequence[Record])
         if why := "; ".join(str(c["error"]) for c in cells if c["error"]):
             errors[scene.id] = why
         else:
-            found[scene.id]["bits_per_second"] = sum(bits_per_second(scene, sensor) for sensor in sensors)
+            found[scene.id]["bits_per_second"] = bits_per_second(scene, sensors)
     if len(scenes) > 1:
         found[MEAN] = {column: mean([v[column] for v in found.values()]) for column in COLUMNS}
     return Row(method.name, sensors, found, errors)
@@ -169,7 +148,7 @@ def make_row(method: Method, scenes: Sequence[Scene], records: Sequence[Record])
 def to_markdown(rows: Sequence[Row], scenes: Sequence[Scene]) -> str:
     """Return the table in Markdown, what its bits are, and what failed."""
     where = scenes[0].id if len(scenes) == 1 else f"mean of {', '.join(scene.id for scene in scenes)}"
-    cells = [[row.method, " and ".join(row.sensors), *(_text(row.summary, c) for c in COLUMNS)] for row in rows]
+    cells = [[row.method, " and ".join(row.sensors), *(value_text(row.summary, c) for c in COLUMNS)] for row in rows]
     bits = (
         f"Bits per second of a camera: pixels x {BITS_OF_A_PIXEL} x frames per second; {BITS_OF_AN_EVENT} for each "
         "event that it fired; pixels x ticks per second of spikes. None is compressed. A row of two sensors has their "
@@ -180,7 +159,8 @@ def to_markdown(rows: Sequence[Row], scenes: Sequence[Scene]) -> str:
     return "\n".join(["# Spikes, frames and events", "", f"{where}.", "", *table, "", bits, "", *errors]) + "\n"
 
 
-def _text(values: Values, column: str) -> str:
+def value_text(values: Values, column: str) -> str:
+    """Return a value with the digits of its column; "-" where there is none."""
     value = values[column]
     if value is None:
         return "-"

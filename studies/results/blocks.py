@@ -140,22 +140,27 @@ def _leaders(group: Group, own: Sequence[Record]) -> list[tuple[str, list[Measur
 
 
 def _cells(ranking: Ranking) -> list[list[str]]:
-    parts = zip(ranking.rows, ranking.behind, ranking.half_widths, ranking.ranks, strict=True)
+    parts = zip(ranking.rows, behind_texts(ranking), ranking.ranks, strict=True)
     return [
         [
             ranks,
             f"`{row.name}`",
             moving,
-            "" if row is ranking.rows[0] else _interval(behind, half),
+            behind,
             psnr,
             *others,
             _time(row, "fit_seconds"),
             _time(row, "render_fps"),
             str(len(row.seeds)),
         ]
-        for row, behind, half, ranks in parts
+        for row, behind, ranks in parts
         for psnr, moving, *others in [_scores(row)]
     ]
+
+
+def behind_texts(ranking: Ranking) -> list[str]:
+    """Return how far each row is behind the first, with half of its interval; nothing for the first."""
+    return ["", *map(_interval, ranking.behind[1:], ranking.half_widths[1:])]
 
 
 def _scores(row: MeasuredRow) -> list[str]:

@@ -11,16 +11,16 @@ from tyro.conf import OmitArgPrefixes
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import find_methods
 from spike4dgs.benchmark.reports.console import make_console
-from spike4dgs.studies.results import conditions
 from spike4dgs.studies.results.code_state import check_clean, code_state, find_root
-from spike4dgs.studies.results.images import TABLE6
 from spike4dgs.studies.results.loose_figures import counts, loose_figures, read_ratchet, risen, tighten
 from spike4dgs.studies.results.pages import outdated, pages_of, write_pages
 from spike4dgs.studies.results.plan import ABLATIONS, PLAN, TRIAL, Cell, cells_of
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.sweep import SweepSettings, sweep
+from spike4dgs.studies.results.tables import conditions, modality
+from spike4dgs.studies.results.tables.images import TABLE6
 
-_GROUPS = (*PLAN, TABLE6, *ABLATIONS, conditions.GROUP, conditions.REFINED, conditions.CONTENT)
+_GROUPS = (*PLAN, TABLE6, *ABLATIONS, conditions.GROUP, conditions.REFINED, conditions.CONTENT, modality.GROUP)
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Choice:
 
     Args:
         only: Groups of the plan: table1 to table4, table6, table7, unposed (table 1, poses estimated), views-3 to
-            views-8 (table 5), conditions, conditions-refined, content, or trial (two tiny scenes). All but trial if
-            left out.
+            views-8 (table 5), conditions, conditions-refined, content, modality, or trial (two tiny scenes). All but
+            trial if left out.
         rows: Rows by name; all of the groups if left out.
         scenes_of: Folder of the scenes. Those of the plan that are not there are left out.
         out: Folder for predictions and checkpoints.

@@ -10,11 +10,12 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.studies.kit.blocks import pattern
 from spike4dgs.studies.results.blocks import NINE, headline_block, home_block, lead_block, scenes_block, table_block
-from spike4dgs.studies.results.conditions import conditions_block, content_block
-from spike4dgs.studies.results.images import images_block
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, TABLE3, TABLE4, TABLE7
-from spike4dgs.studies.results.published import pairs_block, published_block, unposed_block, views_block
 from spike4dgs.studies.results.records import Record
+from spike4dgs.studies.results.tables.conditions import conditions_block, content_block
+from spike4dgs.studies.results.tables.images import images_block
+from spike4dgs.studies.results.tables.modality import modality_block
+from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
     "conditions": conditions_block,
@@ -22,6 +23,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "headline": lambda records: headline_block(NINE, records),
     "home": home_block,
     "lead": lambda records: lead_block(NINE, records),
+    "modality": modality_block,
     "nine-scenes": lambda records: table_block(NINE, records),
     "pairs": pairs_block,
     "published": lambda records: published_block(TABLE1, 1, records),

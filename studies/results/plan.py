@@ -127,10 +127,13 @@ PLAN = (TABLE1, TABLE2)  # the main tables; see also `ABLATIONS` and `conditions
 
 def ablation(name: str, table: PublishedTable, scenes: tuple[str, ...], split: str = "center") -> Group:
     """Return the group of a table of the paper with one seed. Rows that need DUSt3R's checkpoint are left out."""
+    return Group(name, table.title, scenes, once(row for row in table.rows if "dust3r" not in row), split=split)
+
+
+def once(names: Iterable[str]) -> tuple[Row, ...]:
+    """Return rows with one seed, as the main tables have them and others too."""
     known = {row.name: replace(row, seeds=1) for row in ROWS}
-    names = (row for row in table.rows if "dust3r" not in row)
-    rows = (known.get(row) or Row(row, tuned_on=_tuned_on(row)) for row in names)
-    return Group(name, table.title, scenes, tuple(rows), split=split)
+    return tuple(known.get(name) or Row(name, tuned_on=_tuned_on(name)) for name in names)
 
 
 def _tuned_on(row: str) -> str:

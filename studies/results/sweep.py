@@ -27,8 +27,6 @@ from spike4dgs.benchmark.runs.run import JobFiles, Settings, check_inputs, run_c
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.entry import typical_fit_seconds
 from spike4dgs.studies.results.code_state import CodeState, code_digest
-from spike4dgs.studies.results.images import SUFFIX as IMAGES
-from spike4dgs.studies.results.images import measure_images
 from spike4dgs.studies.results.plan import Cell, knowledge_of
 from spike4dgs.studies.results.records import (
     DIGITS,
@@ -39,9 +37,13 @@ from spike4dgs.studies.results.records import (
     key_of,
     read_records,
     scores_of,
+    short,
     write_row,
 )
 from spike4dgs.studies.results.scenes import revisions_of
+from spike4dgs.studies.results.tables.images import SUFFIX as IMAGES
+from spike4dgs.studies.results.tables.images import measure_images
+from spike4dgs.studies.sensors import bits_per_second, sensors_of
 
 DEVICE = "cpu"  # of every published number
 
@@ -198,7 +200,14 @@ def _measure(todo: Sequence[Cell], methods: Mapping[str, Method], kept: _Kept, c
     with RunDisplay(console, len(jobs), [cell.row for cell in todo], typical_fit_seconds()) as display:
         for k, scored in run_cells(jobs, shared, selection, display):
             job = jobs[k].job
-            kept.keep(todo[k], {"knowledge": knowledge_of(job.method), **scores_of(scored[-1 if job.refined else 0])})
+            kept.keep(
+                todo[k],
+                {
+                    "knowledge": knowledge_of(job.method),
+                    "bits_per_second": short(bits_per_second(job.scene, sensors_of(job.method))),
+                    **scores_of(scored[-1 if job.refined else 0]),
+                },
+            )
             if settings.limit_hours is not None and time.monotonic() - start > 3600 * settings.limit_hours:
                 display.say(f"--limit-hours {settings.limit_hours:g}: no further cell is begun")
                 return

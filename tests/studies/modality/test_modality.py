@@ -16,7 +16,8 @@ from rich.console import Console
 from spike4dgs.benchmark.method import find_methods
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.studies.modality.command import ROWS, bits_per_second, compare, sensors_of
+from spike4dgs.studies.modality.command import ROWS, compare
+from spike4dgs.studies.sensors import bits_per_second, sensors_of
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +36,9 @@ def test_every_row_is_a_method_of_known_sensors() -> None:
 
 def test_bits_of_a_camera(scene: Scene) -> None:
     pixels = 40 * 24
-    assert bits_per_second(scene, "spikes") == pixels * 20_000
-    assert bits_per_second(scene, "frames") == pixels * 8 * 60
-    assert bits_per_second(scene, "events") == pytest.approx(50 * 64 / 0.004)  # 50 events in 4 ms
+    assert bits_per_second(scene, ("spikes",)) == pixels * 20_000
+    assert bits_per_second(scene, ("frames",)) == pixels * 8 * 60
+    assert bits_per_second(scene, ("events",)) == pytest.approx(50 * 64 / 0.004)  # 50 events in 4 ms
 
 
 def test_the_table_has_what_the_records_have(scene: Scene, tmp_path: Path) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.stats import ttest_rel
 
 from spike4dgs.studies.results.blocks import (
@@ -18,12 +20,21 @@ from spike4dgs.studies.results.blocks import (
     table_block,
 )
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
-from spike4dgs.studies.results.conditions import CONDITIONS, CONTENT, REFINED, WORLDS, conditions_block, content_block
-from spike4dgs.studies.results.conditions import GROUP as ON_CONDITIONS
-from spike4dgs.studies.results.images import TABLE6, images_block
 from spike4dgs.studies.results.pages import BLOCKS
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row
-from spike4dgs.studies.results.published import pairs_block, published_block, unposed_block, views_block
+from spike4dgs.studies.results.tables.conditions import (
+    CONDITIONS,
+    CONTENT,
+    REFINED,
+    WORLDS,
+    conditions_block,
+    content_block,
+)
+from spike4dgs.studies.results.tables.conditions import GROUP as ON_CONDITIONS
+from spike4dgs.studies.results.tables.images import TABLE6, images_block
+from spike4dgs.studies.results.tables.modality import GROUP as ON_SENSORS
+from spike4dgs.studies.results.tables.modality import modality_block, plot_modality
+from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 
 SHOWN = {  # a block -> two rows that it has, if not those of the tables
     "published": ("spike4dgs", "tfp+stg"),
@@ -53,6 +64,7 @@ def record(row: str, scene: str, moving: float, seed: int = 0, **changes: Any) -
         "code": "00000000000b" if row.startswith("spike4dgs") else "00000000000a",
         "tuned_on": "here" if row == OURS else "elsewhere",
         "knowledge": "uncalibrated" if row == "tfp+stg" else "calibrated",
+        "bits_per_second": 5e8,
         "metrics": metrics,
         "fit_seconds": 30.4,
         "render_fps": 120.6,
@@ -196,7 +208,7 @@ def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None
 @pytest.mark.parametrize("name", BLOCKS)
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
     assert BLOCKS[name]([]) == [NOTHING]
-    scenes = {"conditions": ON_CONDITIONS, "content": CONTENT, "table2": TABLE2}.get(
+    scenes = {"conditions": ON_CONDITIONS, "content": CONTENT, "modality": ON_SENSORS, "table2": TABLE2}.get(
         name.removesuffix("-scenes"), NINE
     ).scenes
     rows = SHOWN.get(name, ("spike4dgs-x", "tfp+rig-flat+stg"))
@@ -297,3 +309,24 @@ def test_images_stand_beside_the_papers_order_corrected_and_not():
     assert images_block([record("tfp.images", s, 26.0, quiet=False, render_fps=200.0) for s in TABLE6.scenes])[
         2
     ].startswith("| `tfp` | (5) |")
+
+
+def test_sensors_are_ranked_where_things_move_beside_the_bits_they_send(tmp_path: Path) -> None:
+    bits = {"spike4dgs-x": 5e8, "rgb+stg": 1.2e7, "edi+stg": 8.6e7}
+    moving = {"spike4dgs-x": 38.0, "rgb+stg": 25.0, "edi+stg": 31.0}
+    found = [
+        record(row, scene, moving[row] + k, bits_per_second=bits[row])
+        for row in bits
+        for k, scene in enumerate(ON_SENSORS.scenes)
+    ]
+    found.append(record("rgb+4dgs", ON_SENSORS.scenes[0], 50.0))
+    lines = modality_block(found)
+    assert [line.split(" | ")[:5] for line in lines[2:5]] == [
+        ["| 1", "`spike4dgs-x`", "spikes", "500", "42.00"],
+        ["| 2", "`edi+stg`", "frames and events", "86", "35.00"],
+        ["| 3", "`rgb+stg`", "frames", "12", "29.00"],
+    ]
+    assert "| 7.00 ± 0.00 |" in lines[3] and "28 of 90 planned cells" in lines[-1]
+    plot_modality(tmp_path / "modality.png", found)
+    with Image.open(tmp_path / "modality.png") as image:
+        assert np.asarray(image.convert("L")).std() > 10

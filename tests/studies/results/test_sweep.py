@@ -102,6 +102,7 @@ def test_a_record_says_what_was_measured_of_what(folder: Path) -> None:
     assert scene.revision.startswith(record["revision"]) and record["commit"] == STATE.commit
     assert (record["tuned_on"], record["knowledge"], record["quiet"]) == ("not tuned", "calibrated", False)
     assert {"psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip", "temporal_error"} <= set(record["metrics"])
+    assert record["bits_per_second"] == scene.meta["width"] * scene.meta["height"] * scene.rate_hz
     predictions = list((folder / "out").rglob("*.exr"))
     assert len(predictions) == 3 and predictions[0].is_relative_to(folder / "out" / record["code"])
 

@@ -28,14 +28,20 @@ class Condition:
     """A condition, and the options of `make-dataset` that make it. `refined`: scored at the fitted held-out pose."""
 
     name: str
-    options: str = ""
+    physics: str = ""
+    ms: int | None = None  # the clip's length, if not that of the profile
     refined: bool = False
+
+    @property
+    def options(self) -> str:
+        """The options of `make-dataset`."""
+        return self.physics if self.ms is None else f"{self.physics} --seconds {self.ms / 1000:g}".strip()
 
     @cached_property
     def scenes(self) -> tuple[str, ...]:
         """The ids of its scenes, one for each world."""
-        physics = tyro.cli(PhysicsOptions, args=self.options.split()).physics()
-        return tuple(f"{world}-small{physics.suffix}" for world in WORLDS)
+        suffix = tyro.cli(PhysicsOptions, args=self.physics.split()).physics().suffix
+        return tuple(f"{world}-small{'' if self.ms is None else f'-{self.ms}ms'}{suffix}" for world in WORLDS)
 
 
 CONDITIONS = (
@@ -54,13 +60,17 @@ CONDITIONS = (
     Condition("light 1/64", "--light 0.015625"),
     Condition("light times 2", "--light 2"),
     Condition("twice as fast", "--speed 2"),
+    Condition("four times as fast", "--speed 4"),
+    Condition("5 ms", ms=5),
+    Condition("100 ms", ms=100),
+    Condition("the array moves", "--array-motion 2 --array-rotation 60"),
 )
 GROUP = Group(
     "conditions",
     "Conditions of camera and light",
     tuple(dict.fromkeys(scene for condition in CONDITIONS for scene in condition.scenes)),
     (
-        Row("spike4dgs-x", 1, OUR_TRIALS, ours=True),
+        Row("spike4dgs-x", 3, OUR_TRIALS, ours=True),
         Row("tfp+rig-flat+stg"),
         Row("spike4dgs", 1, OUR_TRIALS, ours=True),
         Row("spk2img+stg"),
