@@ -34,7 +34,7 @@ def make_dataset(
 
     Args:
         worlds: Names of worlds, such as car turntable.
-        all: Make all worlds but those that are hard by design: appear, beads, blank, flash, mirror.
+        all: Make all worlds but those that are hard by design: appear, beads, blank, flash, mirror, rain.
         out: Folder in which the scene folders appear.
         audit: Compare random ticks and ground truth with full renderings of 4 times the samples; see the report.
         replace: Make damaged scenes, and scenes with other settings, again.

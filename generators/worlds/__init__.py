@@ -13,7 +13,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.plugins import find_plugins
 from spike4dgs.generators.worlds import bicycle, bird, bricks, car, chips, jaywalk, motor, turntable, van
 from spike4dgs.generators.worlds.base import Deforming, Part, RigSpec, World, WorldScene, build_at
-from spike4dgs.generators.worlds.hard import appear, beads, blank, flash, mirror
+from spike4dgs.generators.worlds.hard import appear, beads, blank, flash, mirror, rain
 
 __all__ = ["HARD", "OURS", "WORLDS", "Deforming", "Part", "RigSpec", "World", "WorldScene", "build_at"]
 
@@ -35,7 +35,7 @@ OURS: dict[str, World] = {
 }
 
 HARD: dict[str, World] = {
-    world.name: world for world in (appear.WORLD, beads.WORLD, blank.WORLD, flash.WORLD, mirror.WORLD)
+    world.name: world for world in (appear.WORLD, beads.WORLD, blank.WORLD, flash.WORLD, mirror.WORLD, rain.WORLD)
 }
 
 

@@ -288,8 +288,8 @@ def test_hard_content_has_a_column_for_each_world():
         record("c", "flash-1-small", 1.0),
     ]
     lines = content_block(found)
-    assert lines[0] == "| row | appear | beads | blank | flash | mirror |"
-    assert lines[2:4] == [f"| `{OURS}` | - | - | - | 27.00 / 25.00 | 32.00 / 30.00 |", ""]
+    assert lines[0] == "| row | appear | beads | blank | flash | mirror | rain |"
+    assert lines[2:4] == [f"| `{OURS}` | - | - | - | 27.00 / 25.00 | 32.00 / 30.00 | - |", ""]
 
 
 def test_images_stand_beside_the_papers_order_corrected_and_not():
