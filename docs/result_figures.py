@@ -1,7 +1,7 @@
 """Write figures of the results pages that no command writes: `python docs/result_figures.py FIGURE PATHS`.
 
-images STRIP OUT: of strip_SCENE.png of `speed images`. sensor SCENE OUT. uncalibrated OUT: of the records. sheets SWEEP
-SCENES FOLDER: of the predictions of `report results`, and the scenes of the track `ideal`.
+images STRIP OUT: of strip_SCENE.png of `speed images`. sensor SCENE OUT. conditions, modality and uncalibrated OUT: of
+the records. sheets SWEEP SCENES FOLDER, content SWEEP SCENES OUT: of the predictions of `report results` on the scenes.
 """
 
 from __future__ import annotations
@@ -16,15 +16,17 @@ from spike4dgs.benchmark import open_scene
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.measure import measure
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.reports.figure import new_figure, save_figure
-from spike4dgs.benchmark.reports.panels import make_panels
+from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
+from spike4dgs.benchmark.reports.panels import crops, make_panels
 from spike4dgs.benchmark.reports.sheet import make_sheet
-from spike4dgs.benchmark.scene.images import read_exr
+from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.studies.results.blocks import NINE, of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
 from spike4dgs.studies.results.records import read_records
+from spike4dgs.studies.results.tables import conditions as on_conditions
+from spike4dgs.studies.results.tables.modality import plot_modality
 from spike4dgs.studies.results.tables.published import given_row
 
 RECORDS = Path(__file__).parent.parent / "studies" / "results" / "records"
@@ -41,6 +43,11 @@ SHOWN = (  # rows of a sheet: ours, the best tuned rival, and each kind of the p
 )
 COLUMNS = 8  # of the strip: truth and seven image makers
 TFP_TICKS = 40
+LEVELS = {  # of a panel: its axis -> the names of conditions, by amount
+    "light": {1 / 64: "light 1/64", 1 / 16: "light 1/16", 1 / 4: "light 1/4", 1: "none", 2: "light times 2"},
+    "speed": {1: "none", 2: "twice as fast", 4: "four times as fast"},
+    "length of the clip, ms": {5: "5 ms", 20: "none", 100: "100 ms"},
+}
 SHEET_WIDTH = 1500  # pixels
 
 
@@ -94,6 +101,55 @@ def uncalibrated(out: Path) -> None:
     _save(figure, out)
 
 
+def modality(out: Path) -> None:
+    """Show PSNR where things move against bits per second, from the records."""
+    png = out.with_suffix(".png")
+    plot_modality(png, list(read_records(RECORDS).values()))
+    _as_webp(png, out)
+
+
+def conditions(out: Path) -> None:
+    """Show PSNR where things move by the amount of light, the speed and the length of the clip, row by row."""
+    records = of_group(on_conditions.GROUP, list(read_records(RECORDS).values()))
+    known = {condition.name: condition for condition in on_conditions.CONDITIONS}
+    figure = new_figure((11, 4), "constrained")
+    panels = figure.subplots(1, len(LEVELS), sharey=True)
+    for axes, (title, levels) in zip(panels, LEVELS.items(), strict=True):
+        for k, planned in enumerate(on_conditions.GROUP.rows):
+            rows = {x: rows_of([planned.name], known[name].scenes, records)[0] for x, name in levels.items()}
+            there = {x: row.mean(RANKED_BY) for x, row in rows.items() if row.is_complete}
+            axes.plot(list(there), list(there.values()), "o-", color=method_color(k), label=planned.name)
+        axes.set_xscale("log")
+        axes.set_xticks(list(levels), [f"{x:g}" if x >= 1 else f"1/{1 / x:g}" for x in levels])
+        axes.minorticks_off()
+        axes.set_xlabel(title)
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("PSNR where things move, dB")
+    panels[0].legend(fontsize=8)
+    _save(figure, out)
+
+
+def content(sweep: Path, scenes: Path, out: Path) -> None:
+    """Show a crop of each world with hard content: truth, and what each row renders, at the middle of the clip."""
+    group = on_conditions.CONTENT
+    figure = new_figure((1.9 * (len(group.rows) + 1), 1.25 * len(group.scenes)), "constrained")
+    axes = figure.subplots(len(group.scenes), len(group.rows) + 1)
+    for k, name in enumerate(group.scenes):
+        scene = open_scene(scenes / name)
+        target = scene.targets[len(scene.targets) // 2]
+        truth = scene.ground_truth(target)
+        (box,) = crops([scene.moving(target)])
+        folders = [_predictions(sweep, row.name, name) for row in group.rows]
+        images = [folder and read_exr(folder / f"{target.name}.exr", truth.shape) for folder in folders]
+        for j, image in enumerate((truth, *images)):
+            axes[k, j].set_axis_off()
+            if image is not None and box is not None:
+                axes[k, j].imshow(encode_srgb(box.of(image)), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    for column, title in zip(axes[0], ("truth", *(row.name for row in group.rows)), strict=True):
+        column.set_title(title, fontsize=8)
+    _save(figure, out, SHEET_WIDTH)
+
+
 def _moving(group: Group) -> dict[str, float]:
     own = of_group(group, list(read_records(RECORDS).values()))
     rows = rows_of([row.name for row in group.rows], group.scenes, own)
@@ -104,10 +160,14 @@ def sheets(sweep: Path, scenes: Path, out: Path) -> None:
     """Write a sheet of each of the nine scenes: truth, and what the sweep's fits with seed 0 render."""
     for name in NINE.scenes:
         scene = open_scene(scenes / name)
-        found = {row: next(sweep.glob(f"*/quick-center/seed-0/predictions/{row}/{name}"), None) for row in SHOWN}
+        found = {row: _predictions(sweep, row, name) for row in SHOWN}
         folders = {row: folder for row, folder in found.items() if folder}
         records = [_scored(row, scene, folder) for row, folder in folders.items()]
         _save(make_sheet(make_panels(scene, folders, records)), out / f"{name.partition('-')[0]}.webp", SHEET_WIDTH)
+
+
+def _predictions(sweep: Path, row: str, scene: str) -> Path | None:
+    return next(sweep.glob(f"*/quick-center/seed-0/predictions/{row}/{scene}"), None)
 
 
 def _scored(row: str, scene: Scene, folder: Path) -> dict[str, Any]:
@@ -124,6 +184,10 @@ def _scored(row: str, scene: Scene, folder: Path) -> dict[str, Any]:
 def _save(figure: object, out: Path, width: int | None = None) -> None:
     png = out.with_suffix(".png")
     save_figure(figure, png)  # type: ignore[arg-type]
+    _as_webp(png, out, width)
+
+
+def _as_webp(png: Path, out: Path, width: int | None = None) -> None:
     image = Image.open(png).convert("RGB")
     if width is not None:
         image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
@@ -131,7 +195,15 @@ def _save(figure: object, out: Path, width: int | None = None) -> None:
     png.unlink()
 
 
-FIGURES = {"images": images, "sensor": sensor, "uncalibrated": uncalibrated, "sheets": sheets}
+FIGURES = {
+    "conditions": conditions,
+    "content": content,
+    "images": images,
+    "modality": modality,
+    "sensor": sensor,
+    "sheets": sheets,
+    "uncalibrated": uncalibrated,
+}
 
 if __name__ == "__main__":
     FIGURES[sys.argv[1]](*map(Path, sys.argv[2:]))
