@@ -19,6 +19,7 @@ from spike4dgs.studies.results.records import DIGITS, Record
 NOTHING = "No cell of this table has been measured yet."
 NO_LEAD = "No row of ours and another with equal knowledge have been measured on all scenes yet."
 NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes), ALL_ROWS)
+SMALL_NETWORK = "`spk2img` is a small network that we trained: width 8, published 64, and 2,500 steps."
 _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
 _BOTH = ("psnr", RANKED_BY)
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
@@ -241,7 +242,8 @@ def provenance(own: Sequence[Record], *groups: Group) -> str:
         f"budget {groups[0].budget}",
         f"{len(measured)} of {planned} planned cells",
     ]
-    return " ".join([f"{'; '.join(facts)}.", *_mixed_code(own), _tuning(own)])
+    small = [SMALL_NETWORK] if any(r["row"].startswith("spk2img") for r in own) else []
+    return " ".join([f"{'; '.join(facts)}.", *_mixed_code(own), _tuning(own), *small])
 
 
 def _processors(own: Iterable[Record]) -> str:
