@@ -260,7 +260,7 @@ def _mixed_code(own: Iterable[Record]) -> list[str]:
     by_commit: dict[str, dict[str, None]] = {}
     for r in own:
         # Digests of methods in `method` leave the baselines out; those of tuned rows cover their settings.
-        row = r["row"].removesuffix(REFINED)
+        row = r["row"].removesuffix(REFINED).partition("[")[0]
         kind = row if is_tuned(row) else "ours" if row in OURS else "theirs"
         codes.setdefault(kind, set()).add(r["code"])
         by_commit.setdefault(_commit(r), {})[f"`{r['row']}`"] = None
@@ -277,5 +277,7 @@ def _tuning(own: Iterable[Record]) -> str:
         rows.setdefault(on, []).append(f"`{name}`")
     common = max(rows, key=lambda on: len(rows[on]))
     order = sorted(rows, key=lambda on: (on == common, on))
-    texts = [f"{on} ({'the others' if on == common and len(rows) > 1 else ', '.join(rows[on])})" for on in order]
+    if len(rows) == 1:
+        return f"Tuned on: {common}."
+    texts = [f"{on} ({'the others' if on == common else ', '.join(rows[on])})" for on in order]
     return f"Tuned on: {'; '.join(texts)}."

@@ -24,6 +24,7 @@ CODE = (
     "baselines",
     "studies/results/*.py",
     "studies/images.py",
+    "studies/sensors.py",
     "pyproject.toml",
     "constraints.txt",
 )
@@ -60,7 +61,7 @@ def check_clean(state: CodeState, allow_dirty: bool) -> None:
 
 def code_digest(row: str) -> str:
     """Return a digest of the sources that a row's method and its scores come from, and of searched settings."""
-    row = row.removesuffix(REFINED)
+    row = row.removesuffix(REFINED).partition("[")[0]  # its name has its settings
     found = sources_sha256([benchmark, method, *([] if row in OURS else [baselines])])
     if is_tuned(row):
         found = sha256_json([found, get_method(row).params["settings"]])

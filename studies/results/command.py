@@ -17,10 +17,19 @@ from spike4dgs.studies.results.pages import outdated, pages_of, write_pages
 from spike4dgs.studies.results.plan import ABLATIONS, PLAN, TRIAL, Cell, cells_of
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.sweep import SweepSettings, sweep
-from spike4dgs.studies.results.tables import conditions, modality
+from spike4dgs.studies.results.tables import conditions, modality, parts
 from spike4dgs.studies.results.tables.images import TABLE6
 
-_GROUPS = (*PLAN, TABLE6, *ABLATIONS, conditions.GROUP, conditions.REFINED, conditions.CONTENT, modality.GROUP)
+_GROUPS = (
+    *PLAN,
+    TABLE6,
+    *ABLATIONS,
+    conditions.GROUP,
+    conditions.REFINED,
+    conditions.CONTENT,
+    modality.GROUP,
+    parts.GROUP,
+)
 
 
 @dataclass(frozen=True)
@@ -29,8 +38,8 @@ class Choice:
 
     Args:
         only: Groups of the plan: table1 to table4, table6, table7, unposed (table 1, poses estimated), views-3 to
-            views-8 (table 5), conditions, conditions-refined, content, modality, or trial (two tiny scenes). All but
-            trial if left out.
+            views-8 (table 5), conditions, conditions-refined, content, modality, parts, or trial (two tiny scenes).
+            All but trial if left out.
         rows: Rows by name; all of the groups if left out.
         scenes_of: Folder of the scenes. Those of the plan that are not there are left out.
         out: Folder for predictions and checkpoints.

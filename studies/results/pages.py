@@ -15,6 +15,7 @@ from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.conditions import conditions_block, content_block
 from spike4dgs.studies.results.tables.images import images_block
 from spike4dgs.studies.results.tables.modality import modality_block
+from spike4dgs.studies.results.tables.parts import parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
@@ -26,6 +27,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "modality": modality_block,
     "nine-scenes": lambda records: table_block(NINE, records),
     "pairs": pairs_block,
+    "parts": parts_block,
     "published": lambda records: published_block(TABLE1, 1, records),
     "table1": lambda records: table_block(TABLE1, records),
     "table1-scenes": lambda records: scenes_block(TABLE1, records),

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from scipy.stats import ttest_rel
 
+from spike4dgs.benchmark.method import get_method
 from spike4dgs.studies.results.blocks import (
     NINE,
     NO_LEAD,
@@ -34,6 +35,8 @@ from spike4dgs.studies.results.tables.conditions import GROUP as ON_CONDITIONS
 from spike4dgs.studies.results.tables.images import TABLE6, images_block
 from spike4dgs.studies.results.tables.modality import GROUP as ON_SENSORS
 from spike4dgs.studies.results.tables.modality import modality_block, plot_modality
+from spike4dgs.studies.results.tables.parts import GROUP as PARTS
+from spike4dgs.studies.results.tables.parts import SWITCHES, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 
 SHOWN = {  # a block -> two rows that it has, if not those of the tables
@@ -45,6 +48,7 @@ SHOWN = {  # a block -> two rows that it has, if not those of the tables
     "table7": ("spike4dgs", "msdi+4dgs"),
     "unposed": ("spike4dgs-uncalibrated", "tfp+colmap+stg"),
     "pairs": ("tfp+stg", "tfp+4dgs"),
+    "parts": ("spike4dgs-x",),
 }
 SCENES = ("bricks-0-small", "chips-0-small", "turntable-0-small", "bird-0-small")
 OURS = "spike4dgs-x"
@@ -208,9 +212,8 @@ def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None
 @pytest.mark.parametrize("name", BLOCKS)
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
     assert BLOCKS[name]([]) == [NOTHING]
-    scenes = {"conditions": ON_CONDITIONS, "content": CONTENT, "modality": ON_SENSORS, "table2": TABLE2}.get(
-        name.removesuffix("-scenes"), NINE
-    ).scenes
+    of = {"conditions": ON_CONDITIONS, "content": CONTENT, "modality": ON_SENSORS, "parts": PARTS, "table2": TABLE2}
+    scenes = of.get(name.removesuffix("-scenes"), NINE).scenes
     rows = SHOWN.get(name, ("spike4dgs-x", "tfp+rig-flat+stg"))
     split = {"split": "views-3"} if name == "table5" else {}
     text = "\n".join(BLOCKS[name]([record(row, s, 30 + k, **split) for row in rows for k, s in enumerate(scenes)]))
@@ -330,3 +333,20 @@ def test_sensors_are_ranked_where_things_move_beside_the_bits_they_send(tmp_path
     plot_modality(tmp_path / "modality.png", found)
     with Image.open(tmp_path / "modality.png") as image:
         assert np.asarray(image.convert("L")).std() > 10
+
+
+def test_a_part_is_worth_what_its_absence_costs():
+    off = f"{OURS}[{SWITCHES['coherence of motion']}]"
+    found = [record(OURS, scene, 40.0 + k) for k, scene in enumerate(PARTS.scenes)]
+    found += [record(off, scene, 39.5 + 2 * k) for k, scene in enumerate(PARTS.scenes)]
+    lines = parts_block(found)
+    assert lines[2].endswith("| 42.00 / 40.00 | 43.00 / 41.00 | 44.00 / 42.00 | 43.00 / 41.00 |")
+    (coherence,) = (line for line in lines if line.startswith("| coherence"))
+    assert coherence == (
+        "| coherence of motion | `motion.coherence=0` | -0.50 / -0.50 | +0.50 / +0.50 | +1.50 / +1.50 | +0.50 / +0.50 |"
+    )
+
+
+def test_every_part_is_switched_off_by_settings_that_change_the_recipe():
+    plain, *without = (get_method(row.name).params["settings"] for row in PARTS.rows)
+    assert all(settings != plain for settings in without)

@@ -1,0 +1,53 @@
+"""What each part of `spike4dgs-x` gives: the recipe on development scenes, whole and with one part switched off."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from spike4dgs.studies.kit.timing import markdown
+from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance
+from spike4dgs.studies.results.comparison import rows_of
+from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
+from spike4dgs.studies.results.records import Record
+
+WHOLE = "spike4dgs-x"
+SWITCHES = {  # what is switched off -> the settings that do it
+    "calibration": "images.flat_field=false,initialization.flat_field=false,initialization.noise=0.0004",
+    "points from images with hardly any noise": "initialization.noise=0.0004",
+    "a narrow start": "trainer.initial_scale=1",
+    "the pixel's own filter": "trainer.filter_variance=0.3,trainer.filter_compensated=false",
+    "short spans (at most 20 ticks, not 12)": "image_maker.half=10",
+    "rates for short fits": ",".join(
+        f"trainer.lr_{name}" for name in ("scales=0.005", "quats=0.001", "opacities=0.05", "colors=0.0025")
+    ),
+    "betas for short fits": "trainer.beta1=0.9,trainer.beta2=0.99",
+    "the mean of the last steps": "trainer.average=0",
+    "a frozen background": "trainer.freeze_background=false",
+    "the cap on what moves": "density.max_moving_per_pixel=4",
+    "coherence of motion": "motion.coherence=0",
+    "Huber's loss": "supervision.huber_delta=0",
+    "SSIM in the loss": "supervision.ssim_weight=0",
+}
+GROUP = Group(
+    "parts",
+    "Parts of spike4dgs-x",
+    ("van-10-small", "motor-10-small", "turntable-10-small"),
+    tuple(Row(name, 1, OUR_TRIALS, ours=True) for name in (WHOLE, *(f"{WHOLE}[{s}]" for s in SWITCHES.values()))),
+)
+
+
+def parts_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of the table: PSNR of the whole recipe, and what each part's absence changes, in dB."""
+    own = of_group(GROUP, records)
+    if not any(r["row"] == WHOLE for r in own):
+        return [NOTHING]
+    names = [row.name for row in GROUP.rows]
+    columns = []
+    for scenes in (*((scene,) for scene in GROUP.scenes), GROUP.scenes):
+        whole, *without = rows_of(names, scenes, own)
+        columns.append([both_text(whole), *(change_text(row, whole) for row in without)])
+    firsts = [("nothing", ""), *((part, ", ".join(f"`{s}`" for s in by.split(","))) for part, by in SWITCHES.items())]
+    lines = [[*first, *texts] for first, *texts in zip(firsts, *columns, strict=True)]
+    heads = ("switched off", "by", *(f"`{scene}`" for scene in GROUP.scenes), "mean")
+    legend = f"`{WHOLE}`: whole image / where things move, dB. The first row lists PSNR, the others its change."
+    return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP)]
