@@ -165,10 +165,11 @@ def behind_texts(ranking: Ranking) -> list[str]:
 
 
 def _scores(row: MeasuredRow) -> list[str]:
-    return [_text(row.mean(m), digits) for m, digits in (("psnr", 2), (RANKED_BY, 2), ("ssim", 4), ("flip", 3))]
+    return [metric_text(row.mean(m), digits) for m, digits in (("psnr", 2), (RANKED_BY, 2), ("ssim", 4), ("flip", 3))]
 
 
-def _text(value: float | None, digits: int) -> str:
+def metric_text(value: float | None, digits: int) -> str:
+    """Return a value with so many digits; "-" where there is none."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
@@ -177,7 +178,7 @@ def _interval(value: float, half: float) -> str:
 
 
 def _time(row: MeasuredRow, name: str) -> str:
-    text = _text(row.mean_cost(name), 0)
+    text = metric_text(row.mean_cost(name), 0)
     return text if row.is_quiet or text == "-" else f"({text})"
 
 
@@ -187,13 +188,13 @@ def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = _BOTH) -> 
     means = []
     for metric in metrics:
         known = [m[metric] for m in cells if metric in m]
-        means.append(_text(sum(known) / len(known) if known else None, 2))
+        means.append(metric_text(sum(known) / len(known) if known else None, 2))
     return " / ".join(means) if cells else "-"
 
 
 def both_text(row: MeasuredRow) -> str:
     """Return PSNR of the whole image and where things move, means over scenes and seeds; "-" of an incomplete row."""
-    return " / ".join(_text(row.mean(metric), 2) for metric in _BOTH) if row.is_complete else "-"
+    return " / ".join(metric_text(row.mean(metric), 2) for metric in _BOTH) if row.is_complete else "-"
 
 
 def change_text(row: MeasuredRow, other: MeasuredRow) -> str:

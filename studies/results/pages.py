@@ -15,7 +15,7 @@ from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.conditions import conditions_block, content_block
 from spike4dgs.studies.results.tables.images import images_block
 from spike4dgs.studies.results.tables.modality import modality_block
-from spike4dgs.studies.results.tables.parts import parts_block
+from spike4dgs.studies.results.tables.parts import own_scenes_block, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
@@ -26,6 +26,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "lead": lambda records: lead_block(NINE, records),
     "modality": modality_block,
     "nine-scenes": lambda records: table_block(NINE, records),
+    "own-scenes": own_scenes_block,
     "pairs": pairs_block,
     "parts": parts_block,
     "published": lambda records: published_block(TABLE1, 1, records),

@@ -1,11 +1,12 @@
-"""What each part of `spike4dgs-x` gives: the recipe on development scenes, whole and with one part switched off."""
+"""Tables of `spike4dgs-x` alone: each of the nine scenes, and each part switched off on development scenes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, change_text, metric_text, of_group, provenance
 from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
@@ -34,6 +35,28 @@ GROUP = Group(
     ("van-10-small", "motor-10-small", "turntable-10-small"),
     tuple(Row(name, 1, OUR_TRIALS, ours=True) for name in (WHOLE, *(f"{WHOLE}[{s}]" for s in SWITCHES.values()))),
 )
+_OWN = replace(NINE, rows=tuple(row for row in NINE.rows if row.name == WHOLE))
+_METRICS = {  # heads of columns -> metric, digits
+    "PSNR": ("psnr", 2),
+    "SSIM": ("ssim", 4),
+    "PSNR, moving": ("psnr_dynamic", 2),
+    "SSIM, moving": ("ssim_dynamic", 4),
+    "FLIP": ("flip", 3),
+    "temporal error": ("temporal_error", 4),
+}
+
+
+def own_scenes_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of a table of the nine scenes, and of their mean: what `spike4dgs-x` reaches on each."""
+    own = of_group(_OWN, records)
+    if not own:
+        return [NOTHING]
+    lines = []
+    for scenes in (*((scene,) for scene in NINE.scenes), NINE.scenes):
+        (row,) = rows_of([WHOLE], scenes, own)
+        texts = [metric_text(row.mean(metric), digits) for metric, digits in _METRICS.values()]
+        lines.append(["**mean**" if len(scenes) > 1 else scenes[0].partition("-")[0], *texts])
+    return [*markdown(("scene", *_METRICS), lines), "", f"`{WHOLE}`, means over seeds.", "", provenance(own, _OWN)]
 
 
 def parts_block(records: Sequence[Record]) -> list[str]:

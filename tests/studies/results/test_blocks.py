@@ -36,7 +36,7 @@ from spike4dgs.studies.results.tables.images import TABLE6, images_block
 from spike4dgs.studies.results.tables.modality import GROUP as ON_SENSORS
 from spike4dgs.studies.results.tables.modality import modality_block, plot_modality
 from spike4dgs.studies.results.tables.parts import GROUP as PARTS
-from spike4dgs.studies.results.tables.parts import SWITCHES, parts_block
+from spike4dgs.studies.results.tables.parts import SWITCHES, own_scenes_block, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 
 SHOWN = {  # a block -> two rows that it has, if not those of the tables
@@ -48,6 +48,7 @@ SHOWN = {  # a block -> two rows that it has, if not those of the tables
     "table7": ("spike4dgs", "msdi+4dgs"),
     "unposed": ("spike4dgs-uncalibrated", "tfp+colmap+stg"),
     "pairs": ("tfp+stg", "tfp+4dgs"),
+    "own-scenes": ("spike4dgs-x",),
     "parts": ("spike4dgs-x",),
 }
 SCENES = ("bricks-0-small", "chips-0-small", "turntable-0-small", "bird-0-small")
@@ -333,6 +334,14 @@ def test_sensors_are_ranked_where_things_move_beside_the_bits_they_send(tmp_path
     plot_modality(tmp_path / "modality.png", found)
     with Image.open(tmp_path / "modality.png") as image:
         assert np.asarray(image.convert("L")).std() > 10
+
+
+def test_what_ours_reaches_on_each_scene_and_in_the_mean():
+    found = [record(OURS, scene, 30.0 + k, seed) for k, scene in enumerate(NINE.scenes) for seed in (0, 1)]
+    lines = own_scenes_block([*found, record("a", NINE.scenes[0], 50.0)])
+    assert lines[2] == "| jaywalk | 32.00 | 0.9700 | 30.00 | 0.9600 | 0.050 | - |"
+    assert lines[11] == "| **mean** | 36.00 | 0.9700 | 34.00 | 0.9600 | 0.050 | - |"
+    assert "18 of 27 planned cells" in lines[-1]
 
 
 def test_a_part_is_worth_what_its_absence_costs():
