@@ -235,12 +235,13 @@ def provenance(own: Sequence[Record], *groups: Group) -> str:
     scenes = {r["scene"]: r["revision"] for r in own}
     planned = len(cells_of(groups))
     commits = sorted({_commit(r) for r in own})
+    budgets = list(dict.fromkeys(group.budget for group in groups))
     facts = [
         f"Commit{'s' * (len(commits) > 1)} {', '.join(commits)}",
         f"revisions of {len(scenes)} scenes {sha256_json(scenes)[:DIGITS]}",
         _processors(own),
         f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds)) or '-'}",
-        f"budget {groups[0].budget}",
+        f"budget{'s' * (len(budgets) > 1)} {', '.join(budgets)}",
         f"{len(measured)} of {planned} planned cells",
     ]
     small = [SMALL_NETWORK] if any(r["row"].startswith("spk2img") for r in own) else []

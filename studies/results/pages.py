@@ -17,6 +17,7 @@ from spike4dgs.studies.results.tables.images import images_block
 from spike4dgs.studies.results.tables.modality import modality_block
 from spike4dgs.studies.results.tables.parts import own_scenes_block, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
+from spike4dgs.studies.results.tables.steps import steps_block
 
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
     "conditions": conditions_block,
@@ -30,6 +31,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "pairs": pairs_block,
     "parts": parts_block,
     "published": lambda records: published_block(TABLE1, 1, records),
+    "steps": steps_block,
     "table1": lambda records: table_block(TABLE1, records),
     "table1-scenes": lambda records: scenes_block(TABLE1, records),
     "table2": lambda records: table_block(TABLE2, records),

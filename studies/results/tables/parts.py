@@ -11,6 +11,7 @@ from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
 
+DEVELOPMENT = ("van-10-small", "motor-10-small", "turntable-10-small")
 WHOLE = "spike4dgs-x"
 SWITCHES = {  # what is switched off -> the settings that do it
     "calibration": "images.flat_field=false,initialization.flat_field=false,initialization.noise=0.0004",
@@ -32,7 +33,7 @@ SWITCHES = {  # what is switched off -> the settings that do it
 GROUP = Group(
     "parts",
     "Parts of spike4dgs-x",
-    ("van-10-small", "motor-10-small", "turntable-10-small"),
+    DEVELOPMENT,
     tuple(Row(name, 1, OUR_TRIALS, ours=True) for name in (WHOLE, *(f"{WHOLE}[{s}]" for s in SWITCHES.values()))),
 )
 _OWN = replace(NINE, rows=tuple(row for row in NINE.rows if row.name == WHOLE))

@@ -38,6 +38,7 @@ from spike4dgs.studies.results.tables.modality import modality_block, plot_modal
 from spike4dgs.studies.results.tables.parts import GROUP as PARTS
 from spike4dgs.studies.results.tables.parts import SWITCHES, own_scenes_block, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
+from spike4dgs.studies.results.tables.steps import steps_block
 
 SHOWN = {  # a block -> two rows that it has, if not those of the tables
     "published": ("spike4dgs", "tfp+stg"),
@@ -213,7 +214,14 @@ def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None
 @pytest.mark.parametrize("name", BLOCKS)
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
     assert BLOCKS[name]([]) == [NOTHING]
-    of = {"conditions": ON_CONDITIONS, "content": CONTENT, "modality": ON_SENSORS, "parts": PARTS, "table2": TABLE2}
+    of = {
+        "conditions": ON_CONDITIONS,
+        "content": CONTENT,
+        "modality": ON_SENSORS,
+        "parts": PARTS,
+        "steps": PARTS,
+        "table2": TABLE2,
+    }
     scenes = of.get(name.removesuffix("-scenes"), NINE).scenes
     rows = SHOWN.get(name, ("spike4dgs-x", "tfp+rig-flat+stg"))
     split = {"split": "views-3"} if name == "table5" else {}
@@ -353,6 +361,18 @@ def test_a_part_is_worth_what_its_absence_costs():
     (coherence,) = (line for line in lines if line.startswith("| coherence"))
     assert coherence == (
         "| coherence of motion | `motion.coherence=0` | -0.50 / -0.50 | +0.50 / +0.50 | +1.50 / +1.50 | +0.50 / +0.50 |"
+    )
+
+
+def test_more_steps_stand_beside_a_rows_own():
+    gains = {1.0: 0, 4.0: 1.5, 16.0: 2}
+    found = [record("tfp+stg", s, 30.0 + gain, budget=b) for b, gain in gains.items() for s in PARTS.scenes]
+    found += [record("tfp+4dgs", s, 31.0) for s in PARTS.scenes]
+    lines = steps_block(found)
+    assert "| `tfp+stg` | 32.00 / 30.00 | +1.50 / +1.50 | +2.00 / +2.00 |" in lines
+    assert (
+        "| `tfp+4dgs` | 33.00 / 31.00 | - | - |" in lines
+        and "budgets quick, standard, 16; 12 of 54 planned" in lines[-1]
     )
 
 

@@ -1,0 +1,38 @@
+"""Whether rows have converged: the same fits with more steps, on development scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from spike4dgs.benchmark.method import DEFAULT_BUDGET
+from spike4dgs.studies.kit.timing import markdown
+from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance
+from spike4dgs.studies.results.comparison import rows_of
+from spike4dgs.studies.results.plan import Group, once
+from spike4dgs.studies.results.records import Record
+from spike4dgs.studies.results.tables.parts import DEVELOPMENT
+
+ROWS = ("spike4dgs-x", "spike4dgs", "tfp+rig-flat+stg", "tfp+stg", "tfp+4dgs", "spk2img+stg")
+BUDGETS = (DEFAULT_BUDGET, "standard", "16")  # 1, 4 and 16 times the steps
+GROUPS = tuple(
+    Group(f"steps-{budget}", f"Fits with the budget {budget}", DEVELOPMENT, once(ROWS), budget) for budget in BUDGETS
+)
+
+
+def steps_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of the table: PSNR with a row's own steps, and what more steps change, in dB."""
+    own = [of_group(group, records) for group in GROUPS]
+    if not own[0]:
+        return [NOTHING]
+    lines = []
+    for name in ROWS:
+        first, *more = (rows_of([name], DEVELOPMENT, found)[0] for found in own)
+        lines.append([f"`{name}`", both_text(first), *(change_text(row, first) for row in more)])
+    legend = (
+        f"Whole image / where things move, dB; means of {', '.join(DEVELOPMENT)}. More steps are listed as changes."
+    )
+    return [
+        *markdown(("row", "steps of tables", "4 times", "16 times"), lines),
+        *("", legend, ""),
+        provenance(sum(own, []), *GROUPS),
+    ]
