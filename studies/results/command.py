@@ -17,7 +17,7 @@ from spike4dgs.studies.results.pages import outdated, pages_of, write_pages
 from spike4dgs.studies.results.plan import ABLATIONS, PLAN, TRIAL, Cell, cells_of
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.sweep import SweepSettings, sweep
-from spike4dgs.studies.results.tables import conditions, modality, parts
+from spike4dgs.studies.results.tables import conditions, modality, parts, steps
 from spike4dgs.studies.results.tables.images import TABLE6
 
 _GROUPS = (
@@ -29,6 +29,7 @@ _GROUPS = (
     conditions.CONTENT,
     modality.GROUP,
     parts.GROUP,
+    *steps.GROUPS,
 )
 
 

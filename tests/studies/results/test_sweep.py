@@ -183,7 +183,10 @@ def test_a_scene_of_another_processor_joins_the_records_where_it_differs_by_roun
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        (Choice(only=("table9",)), "--only: expected groups among table1, table2, .*, trial, found table9"),
+        (
+            Choice(only=("table9",)),
+            "--only: expected groups among table1, table2, .*, modality, parts, steps-quick, .*, trial, found table9",
+        ),
         (Choice(only=("trial",), rows=("tfi+stg", "tfp+stg")), "--rows: expected rows among nearest-view, .*tfi.stg;"),
         (
             Choice(only=("trial",), scenes_of=Path("nowhere")),
