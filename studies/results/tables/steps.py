@@ -27,7 +27,8 @@ def steps_block(records: Sequence[Record]) -> list[str]:
     lines = []
     for name in ROWS:
         first, *more = (rows_of([name], DEVELOPMENT, found)[0] for found in own)
-        lines.append([f"`{name}`", both_text(first), *(change_text(row, first) for row in more)])
+        if first.cells:
+            lines.append([f"`{name}`", both_text(first), *(change_text(row, first) for row in more)])
     legend = (
         f"Whole image / where things move, dB; means of {', '.join(DEVELOPMENT)}. More steps are listed as changes."
     )
