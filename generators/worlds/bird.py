@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.generators.worlds.base import Deforming, RigSpec, World, WorldScene, rng_for
+from spike4dgs.generators.worlds.base import Deforming, World, WorldScene, rng_for
 from spike4dgs.generators.worlds.meshes import rotation, translation
 from spike4dgs.generators.worlds.parts import bird_body, garden, street
 
@@ -66,9 +66,7 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         emitters=street.emitters(flight.light, rng),
         poses=lambda t_s: {"bird": pose(t_s)},
         exposure=0.95,
-        rig=RigSpec(
-            center=(0.05, -0.98, 0.98), target=(0.0, 0.06, 0.42), spacing_m=(0.085, 0.072), toe_in=0.8, fov_x_deg=45.0
-        ),
+        rig=garden.RIG,
         shadow_sources=np.append(flight.light.to_sun, 0.0)[None],
         depth_range=(0.4, 60.0),
         notes={

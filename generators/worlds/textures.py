@@ -103,6 +103,9 @@ def wood(shape: tuple[int, int], rng: np.random.Generator, planks: int = 6) -> n
     return image
 
 
+BEACH_BALL: tuple[Colour, ...] = ((0.75, 0.12, 0.08), (0.80, 0.78, 0.70), (0.10, 0.25, 0.60), (0.80, 0.62, 0.10))
+
+
 def cloth(shape: tuple[int, int], rng: np.random.Generator, colours: Sequence[Colour], stripe: int) -> np.ndarray:
     """Return vertical stripes of `stripe` pixels with a woven grain."""
     index = np.arange(shape[1]) // stripe % len(colours)

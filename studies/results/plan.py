@@ -122,7 +122,7 @@ def tuned_rows() -> tuple[Row, ...]:
 ALL_ROWS = (*tuned_rows(), *ROWS)
 TABLE1 = Group("table1", "Table 1: outdoor scenes", track_scenes("ideal", published(1).worlds), ALL_ROWS)
 TABLE2 = Group("table2", "Table 2: objects", track_scenes("ideal", published(2).worlds), ALL_ROWS)
-PLAN = (TABLE1, TABLE2)  # the main tables; see also `ABLATIONS` and `conditions`
+PLAN = (TABLE1, TABLE2)  # the main tables; see also `ABLATIONS` and `tables`
 
 
 def ablation(name: str, table: PublishedTable, scenes: tuple[str, ...], split: str = "center") -> Group:

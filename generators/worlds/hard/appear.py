@@ -15,7 +15,7 @@ from spike4dgs.generators.worlds.meshes import box, ellipsoid, revolve, rotation
 from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, low_rig, room
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2
 from spike4dgs.generators.worlds.surfaces import Lamp, Material
-from spike4dgs.generators.worlds.textures import cloth, wood
+from spike4dgs.generators.worlds.textures import BEACH_BALL, cloth, wood
 
 EDGE_M = 0.20  # from the middle to either board
 _LANE_Y_M = 0.12
@@ -90,7 +90,7 @@ def _screens(rng: np.random.Generator) -> dict[str, Part]:
 
 def _movers(run: _Run, rng: np.random.Generator) -> dict[str, tuple[Part, ...]]:
     face = block_image(run.letter, BLOCKS[run.colour], rng)
-    stripes = cloth((48, 96), rng, [(0.75, 0.12, 0.08), (0.80, 0.78, 0.70), (0.10, 0.25, 0.60)], 16)
+    stripes = cloth((48, 96), rng, BEACH_BALL[:3], 16)
     body = revolve([(0.0, 0.0), (0.045, 0.0), (0.034, 0.055), (0.0, 0.055)], 32)
     hat = revolve([(0.0, 0.112), (0.012, 0.110), (0.026, 0.086), (0.028, 0.084), (0.0, 0.084)], 32)
     coat = cloth((32, 64), rng, [(0.10, 0.25, 0.60), (0.82, 0.62, 0.10)], 8)

@@ -19,7 +19,7 @@ from spike4dgs.generators.worlds.meshes import Mesh, box, ellipsoid, merge, quad
 from spike4dgs.generators.worlds.parts.desk import BLOCKS, block_image, low_rig, room
 from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2
 from spike4dgs.generators.worlds.surfaces import Material
-from spike4dgs.generators.worlds.textures import cloth, paving
+from spike4dgs.generators.worlds.textures import BEACH_BALL, cloth, paving
 
 _PANE = np.array([[-0.36, -0.27], [-0.17, 0.06]])  # its lower corners, x and y
 _PANE_M = 0.42  # its height
@@ -127,7 +127,7 @@ def _frame(feet: np.ndarray, low: float, high: float, thick: float) -> Mesh:
 
 def _movers(throw: _Throw, rng: np.random.Generator) -> dict[str, tuple[Part, ...]]:
     face = block_image(throw.letter, BLOCKS[throw.colour], rng)
-    stripes = cloth((48, 96), rng, [(0.75, 0.12, 0.08), (0.80, 0.78, 0.70), (0.10, 0.25, 0.60)], 16)
+    stripes = cloth((48, 96), rng, BEACH_BALL[:3], 16)
     return {
         "block": (Part(box((0.09, 0.09, 0.09)), Material(face, 0.25)),),
         "ball": (Part(ellipsoid((0.045, 0.045, 0.045), segments=32), Material(stripes, 0.15)),),

@@ -16,7 +16,7 @@ from spike4dgs.generators.worlds.meshes import (
     tube,
 )
 from spike4dgs.generators.worlds.surfaces import Colour, Material
-from spike4dgs.generators.worlds.textures import Canvas, cloth, fractal, mix, paving, plain, wood
+from spike4dgs.generators.worlds.textures import BEACH_BALL, Canvas, cloth, fractal, mix, paving, plain, wood
 
 INK: tuple[Colour, ...] = ((0.55, 0.04, 0.03), (0.03, 0.07, 0.35), (0.03, 0.20, 0.07), (0.03, 0.03, 0.03))
 BLOCKS: tuple[Colour, ...] = ((0.75, 0.22, 0.14), (0.20, 0.50, 0.24), (0.78, 0.58, 0.12), (0.16, 0.32, 0.66))
@@ -97,7 +97,7 @@ def _desk_objects(rng: np.random.Generator) -> dict[str, Part]:
     ruler = Canvas(plain((24, 320), (0.72, 0.60, 0.25)), 1000)
     for j in range(32):
         ruler.rectangle(0.002 + 0.01 * j, 0, 0.0035 + 0.01 * j, 0.014 if j % 5 == 0 else 0.008, (0.05, 0.05, 0.05))
-    beach = cloth((48, 120), rng, [(0.75, 0.12, 0.08), (0.80, 0.78, 0.70), (0.10, 0.25, 0.60), (0.80, 0.62, 0.10)], 15)
+    beach = cloth((48, 120), rng, BEACH_BALL, 15)
     stack = [box((0.20, 0.15, 0.03), (-0.62, 0.45, 0.015)), box((0.17, 0.14, 0.03), (-0.61, 0.46, 0.045))]
     return books | {
         "mug": Part(merge([mug, handle]).at(0.60, 0.12, 0), Material(bands, 0.1)),

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from spike4dgs.generators.worlds.base import Part
+from spike4dgs.generators.worlds.base import Part, RigSpec
 from spike4dgs.generators.worlds.meshes import Mesh, box, ellipsoid, merge, quad, revolve, tube
 from spike4dgs.generators.worlds.surfaces import Material
 from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, paving, plain, wood
 
 WALL_Y = 1.15
+RIG = RigSpec(
+    center=(0.05, -0.98, 0.98), target=(0.0, 0.06, 0.42), spacing_m=(0.085, 0.072), toe_in=0.8, fov_x_deg=45.0
+)
 _POTS = ((-0.78, 0.62, 0.15), (-0.38, 0.86, 0.11), (0.46, 0.78, 0.13), (0.88, 0.56, 0.16), (-1.2, 0.80, 0.13))
 
 
