@@ -14,6 +14,7 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -85,6 +86,7 @@ def trial(device: str = "cuda") -> str:
     """Compile a kernel and run it as the rasteriser does; return what fails, or nothing.
 
     That is on the device that is asked for, on a stream of torch, and in a backward pass too, which has its own thread.
+    The first render may be one without gradients; the trial's are needed there too.
     """
     import torch
 
@@ -104,7 +106,9 @@ def trial(device: str = "cuda") -> str:
 
         one: Any = torch.ones(1, device=device, requires_grad=True)
         one.register_hook(added)  # called with the gradient, in the backward pass
-        with torch.cuda.device(one.device), torch.cuda.stream(torch.cuda.Stream()):  # type: ignore[no-untyped-call]
+        stream: Any = torch.cuda.Stream(one.device)  # type: ignore[no-untyped-call]
+        with torch.cuda.device(one.device), torch.cuda.stream(stream), torch.enable_grad(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*Grid size")  # of one block, which is no news to the user
             two = added(one)
             (1 * one).backward()
             torch.cuda.synchronize()

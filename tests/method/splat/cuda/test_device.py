@@ -17,6 +17,7 @@ from splat_scenes import HARD, far_origin, random_splats, views
 from toy_bursts import write_toy_shard
 from toy_world import ToyWorld
 
+from spike4dgs.benchmark import environment
 from spike4dgs.benchmark.environment import missing_rasterizer
 from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
 from spike4dgs.benchmark.scene.training_bursts import open_folder
@@ -64,6 +65,12 @@ def test_hard_scenes_antialiased_with_depth(scene: Callable[[], tuple[Splats, Vi
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 9])
 def test_any_number_of_channels(channels: int) -> None:
     splat_parity.compare(random_splats(120, channels, seed=20), views(), "cuda", "cuda", depth=True)
+
+
+def test_the_trial_passes_where_nothing_is_differentiated() -> None:
+    environment.trial.cache_clear()  # as in a process whose first render is one of a saved model
+    with torch.no_grad():
+        assert not environment.trial()
 
 
 def test_equal_inputs_give_equal_bits() -> None:
