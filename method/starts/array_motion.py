@@ -25,7 +25,7 @@ from spike4dgs.method.starts.plane_sweep import DepthMap, SweepSettings, agreed,
 
 LEAST_CHANGING = 0.25  # share of a view's pixels that change, median of the views: below it the array stands still
 LEAST_EXPLAINED = 0.7  # share by a path of the pixels that only it or only an array that stands still explains
-LEAST_PX = 0.5  # motion of a still point between the clip's ends, median
+LEAST_PX = 1.0  # motion of a still point between the clip's ends, median: what moves by itself can feign half a pixel
 MOST_WINDOWS = 15  # that are compared; of longer clips some are left out
 _MOST_PIXELS = 8000  # of a view, evenly chosen
 _BLURS_PX = (3.0, 1.5)  # of the images, to find the first step and then; what is left of fixed patterns pulls at less

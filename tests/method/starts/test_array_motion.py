@@ -14,6 +14,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Recipe
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.recipes import METHODS
+from spike4dgs.method.starts.array_motion import Explained
 from spike4dgs.method.starts.base import Initialization, Start
 from spike4dgs.method.starts.rig import RigSettings, rig
 
@@ -51,6 +52,18 @@ def test_an_array_that_stands_still_has_no_path_and_the_same_start(travel, capsy
     found, plain = rig(still, FOLLOWS), rig(still, RigSettings())
     assert found.path is None and not capsys.readouterr().err
     assert np.array_equal(found.points, plain.points) and np.array_equal(found.values, plain.values)
+
+
+@pytest.mark.parametrize(
+    ("share", "motion_px", "believed"),
+    [
+        (0.73, 2.58, True),  # turntable-10, array that moves
+        (0.80, 0.53, False),  # bricks-10, 50 ms: the array stands still, and what flies feigns a path
+        (0.67, 2.58, False),
+    ],
+)
+def test_what_is_believed(share, motion_px, believed):
+    assert Explained(WORLD.path, share, motion_px).believed == believed
 
 
 def test_a_fit_along_the_path_is_sharp_where_a_fit_of_a_still_array_is_not():
