@@ -133,7 +133,7 @@ class Trainer:
         """Make a background of the Gaussians that do not move."""
         moves = moving_points(self.gaussians.means.detach(), self.training_images, self.settings.moving_change)
         self._set_background(self.gaussians.rows(~moves))
-        self.gaussians = self.gaussians.rows(moves).trainable()
+        self.gaussians = self.motion.set_off(self.gaussians.rows(moves), self.training_images).trainable()
 
     def _set_background(self, background: Gaussians) -> None:
         self.background = background

@@ -69,6 +69,10 @@ class Motion(nn.Module):
         """Return the first Gaussians with the parameters that the model keeps of each (`Gaussians.extra`)."""
         return gaussians
 
+    def set_off(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
+        """Return the Gaussians that move as they leave the static stage, before a background that is frozen."""
+        return gaussians
+
     def after_densification(self, edit: Edit, generator: torch.Generator) -> Edit:
         """Return the edit after a change of the Gaussians that densification added."""
         return edit

@@ -1,4 +1,4 @@
-"""The motion `paths`: gray values on polynomial paths that begin at rest in the middle of the clip.
+"""The motion `paths`: gray values on polynomial paths that begin in the middle of the clip, at the speed seen there.
 
 The static stage finds things where they are then; while the times open up, they are followed from there. One Gaussian
 sees its thing for the whole clip, which averages the noise that a short temporal scale would keep. Clips much longer
@@ -18,9 +18,11 @@ from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.polynomial import PolynomialMotion, PolynomialSettings, at_time, move_to
 from spike4dgs.method.training_views.training_images import TrainingImages
+from spike4dgs.method.training_views.velocities import velocities_at
 
 PIECE_TICKS = 400  # 20 ms at 20 kHz
 PIECE_IMAGES = 20  # at least about as many times of a view in each
+FLOW = 0.05  # of a piece: the optical flow of first velocities looks as far to both sides
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,13 @@ class Paths(PolynomialMotion):
     def initialize(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
         """Return all Gaussians at rest in the middle of the clip, for as long as it lasts."""
         return self.timed(gaussians, torch.full((len(gaussians),), 0.5), self.settings.static_temporal_scale)
+
+    def set_off(self, gaussians: Gaussians, images: TrainingImages) -> Gaussians:
+        """Return them with the velocities of what the views see at them in the middle of the clip."""
+        piece = images.n_ticks / self.pieces
+        velocities = piece * velocities_at(gaussians.means, images, FLOW * piece)
+        coefficients = torch.cat([velocities, gaussians.extra["coefficients"][:, 3:]], 1)
+        return replace(gaussians, extra={**gaussians.extra, "coefficients": coefficients})
 
     def learning_rates(self) -> dict[str, Decay]:
         """Return the learning rates: coefficients must follow motion while the times open up, and rest in the end."""
