@@ -7,6 +7,8 @@ Geman and McClure (1985) for the distance between f and J v.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import torch
@@ -58,8 +60,9 @@ def _flow(before: Float32, middle: Float32, after: Float32) -> Float32:
     """Return the mean flow [2, H, W] in px towards `after` and away from `before`; NaN where both differ."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)  # to the pixel
+    flow: Callable[..., Float32] = search.calc
     at, *others = ((255 * np.sqrt(image.clip(0, 1))).astype(np.uint8) for image in (middle, before, after))
-    back, forth = (search.calc(at, other, None).transpose(2, 0, 1) for other in others)
+    back, forth = (flow(at, other, None).transpose(2, 0, 1) for other in others)
     return np.where(np.hypot(*(forth + back)) < DIFFER_PX, (forth - back) / 2, np.float32(np.nan))
 
 
