@@ -8,6 +8,7 @@ Geman and McClure (1985) for the distance between f and J v.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -60,10 +61,10 @@ def _flow(before: Float32, middle: Float32, after: Float32) -> Float32:
     """Return the mean flow [2, H, W] in px towards `after` and away from `before`; NaN where both differ."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)  # to the pixel
-    flow: Callable[..., Float32] = search.calc
+    flow: Callable[..., Any] = search.calc
     at, *others = ((255 * np.sqrt(image.clip(0, 1))).astype(np.uint8) for image in (middle, before, after))
     back, forth = (flow(at, other, None).transpose(2, 0, 1) for other in others)
-    return np.where(np.hypot(*(forth + back)) < DIFFER_PX, (forth - back) / 2, np.float32(np.nan))
+    return np.asarray(np.where(np.hypot(*(forth + back)) < DIFFER_PX, (forth - back) / 2, np.nan), np.float32)
 
 
 def _triangulated(points: Tensor, views: Views, flows: Tensor) -> Tensor:
