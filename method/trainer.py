@@ -130,7 +130,7 @@ class Trainer:
         return tuple(fitted[piece] for piece in sorted(fitted))
 
     def _freeze(self) -> None:
-        """Make a background of the Gaussians that do not move."""
+        """Make a background of the Gaussians that do not move; the others set off."""
         moves = moving_points(self.gaussians.means.detach(), self.training_images, self.settings.moving_change)
         self._set_background(self.gaussians.rows(~moves))
         self.gaussians = self.motion.set_off(self.gaussians.rows(moves), self.training_images).trainable()

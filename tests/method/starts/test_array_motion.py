@@ -73,15 +73,12 @@ def test_a_fit_along_the_path_is_sharp_where_a_fit_of_a_still_array_is_not():
             lambda r, path=path: Start(r.scene.cameras, *WORLD.surfaces(r.scene.cameras[::2], 0.01), path=path)
         )
         parts = Parts({"short": images}, {"true": made}, MOTIONS, SUPERVISIONS)
-        steps = {
-            "trainer.coarse_steps": 60,
-            "trainer.fine_steps": 200,
-            "trainer.freeze_background": False,
-        }  # no velocities
+        # Without a background nothing sets off at its velocity, which would follow the array too.
+        steps = {"trainer.coarse_steps": 60, "trainer.fine_steps": 200}
         recipe = Recipe("test", "short", "true", "paths", "pixel", steps)
         model = RecipeMethod(recipe, parts).fit(WORLD.training, request())
         psnr[name] = WORLD.psnr(model, moving=False)
-    assert psnr["path"] > psnr["still"] + 1.5
+    assert psnr["path"] > psnr["still"] + 2
 
 
 def test_only_the_trainer_follows_an_array():
