@@ -27,6 +27,7 @@ ROUNDS = 6  # of reweighting
 NEAR_PX = 0.3  # a flow that is further from J v than this counts little
 DIFFER_PX = 1.0  # flows to both sides differ by more than this where something is covered, and are left out
 LEAST_VIEWS = 3  # that know the flow at a point
+LEAST_SIDE_PX = 12  # of a view: the search compares patches of 8 pixels, and refuses images that hold hardly one
 PRIOR = 1e-2  # of the views' own weight: cameras stand close together, and know least of motion in depth
 
 
@@ -34,10 +35,10 @@ def velocities_at(points: Tensor, images: TrainingImages, ticks: float) -> Tenso
     """Return the velocities [N, 3] of points [N, 3] in m a tick, in the middle of the clip; 0 where they are not known.
 
     They are means over `ticks` to both sides, or as near to that as there are images: several pixels of motion blur
-    what turns, too few drown in noise. Returns 0 for all where images do not reach that far.
+    what turns, too few drown in noise. Returns 0 for all where images do not reach that far, or are tiny.
     """
     trio = _three_images(images, ticks)
-    if trio is None:
+    if trio is None or min(images.views.width, images.views.height) < LEAST_SIDE_PX:
         return torch.zeros_like(points)
     before, middle, after = trio
     values = in_mean_light(images).images[list(trio)].cpu().numpy()

@@ -79,6 +79,13 @@ def test_images_that_do_not_reach_far_enough_tell_nothing() -> None:
     assert not velocities_at(POINTS, images_of(views(4)), 10).any()
 
 
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (8, 8), (64, 3), (3, 64), (12, 12), (13, 200)])
+def test_tiny_views_are_no_error(width: int, height: int) -> None:
+    v = replace(views(4), width=width, height=height)
+    values = torch.rand(len(TICKS), 4, height, width, generator=torch.Generator().manual_seed(0))
+    assert velocities_at(POINTS, TrainingImages(v, TICKS, values, 400), 50).isfinite().all()
+
+
 @pytest.mark.usefixtures("no_prior")
 def test_missing_images_are_left_out() -> None:
     images = images_of(views(5))
