@@ -20,6 +20,7 @@ from typing import Any, cast
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import FitRequest, training_for
+from spike4dgs.benchmark.runs.apart.allocator import keep_freed_memory
 from spike4dgs.benchmark.runs.apart.messages import (
     DONE,
     FAILED,
@@ -90,6 +91,7 @@ def main() -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.dup2(2, 1)
+    keep_freed_memory()
     try:
         _fit(caller.next(), caller)
     except KeyboardInterrupt:
