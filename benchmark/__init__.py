@@ -10,6 +10,20 @@ from spike4dgs.benchmark.lazy import lazy_names
 if "GOMP_SPINCOUNT" not in os.environ:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+
+def _has_avx2() -> bool:
+    try:
+        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as file:
+            flags = next((line for line in file if line.startswith("flags")), "").split()
+    except OSError:  # not Linux
+        return False
+    return {"avx2", "fma"} <= set(flags)
+
+
+# Before NumPy loads OpenBLAS: its kernels for AVX-512 round otherwise, and poses of scenes would differ by a bit.
+if _has_avx2():
+    os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
+
 if TYPE_CHECKING:
     from spike4dgs.benchmark.errors import UserError
     from spike4dgs.benchmark.method import Budget, FitRequest, Method, Model, Recipe, find_methods, get_method
