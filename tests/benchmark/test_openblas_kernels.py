@@ -38,6 +38,9 @@ def test_poses_have_the_bits_of_the_kernels_for_avx2() -> None:
 def test_every_room_says_so_before_numpy_is_loaded(room: str) -> None:
     code = f"import os, sys, spike4dgs.{room}; print(os.environ['OPENBLAS_CORETYPE'])"
     assert run(code) == "Haswell"
+
+
+def test_numpy_is_loaded_after_the_room_that_says_so() -> None:
     assert run("import sys, spike4dgs.benchmark; print('numpy' in sys.modules)") == "False"
 
 
