@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import tyro
 
 from spike4dgs.benchmark.runs.refinement import SUFFIX
@@ -16,7 +17,7 @@ from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.worlds import HARD
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance, psnr_texts
-from spike4dgs.studies.results.comparison import MeasuredRow, rows_of
+from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
 from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
 
@@ -110,7 +111,23 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         "others its change."
     )
-    return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP, REFINED)]
+    return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, GROUP, REFINED)]
+
+
+def _seeds(names: Sequence[str], own: Sequence[Record]) -> list[str]:
+    """Return a sentence for each row with several seeds: how far they move a scene's values, pooled over scenes."""
+    sentences = []
+    for name in names:
+        rows = [row for scene in GROUP.scenes for row in rows_of([name], (scene,), own) if len(row.seeds) > 1]
+        values = [(row.values("psnr"), row.values(RANKED_BY)) for row in rows]
+        variances = [[np.var(v[0], ddof=1) for v in both] for both in values if all(both)]
+        if variances:
+            deviations = " / ".join(f"{d:.2f}" for d in np.sqrt(np.mean(variances, axis=0)))
+            seeds = max(len(row.seeds) for row in rows)
+            sentences.append(
+                f"With {seeds} seeds of `{name}` a scene's values have a standard deviation of {deviations} dB."
+            )
+    return sentences
 
 
 def _rows(names: Sequence[str], condition: Condition, own: Sequence[Record]) -> list[MeasuredRow]:

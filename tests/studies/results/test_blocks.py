@@ -282,6 +282,16 @@ def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_wor
     assert "6 of" in lines[-1]
 
 
+def test_conditions_say_how_much_depends_on_the_seed():
+    """Variances of 1 and 3 dB^2 in two scenes are a deviation of the root of 2; one seed says nothing."""
+    one, other, alone = ON_CONDITIONS.scenes[:3]
+    found = [record(OURS, one, 30.0 + k, seed=k) for k in range(3)] + [record(OURS, alone, 99.0)]
+    found += [record(OURS, other, 40.0 + np.sqrt(3) * k, seed=k) for k in range(3)]
+    sentence = f"With 3 seeds of `{OURS}` a scene's values have a standard deviation of 1.41 / 1.41 dB."
+    assert conditions_block(found)[-3].endswith(sentence)
+    assert "seeds of" not in "".join(conditions_block([*found[:1], *found[3:5]]))
+
+
 def test_a_condition_with_refined_held_out_poses_has_the_scores_of_the_refined_row():
     first, poses = CONDITIONS[0], next(c for c in CONDITIONS if "--pose-noise" in c.options and not c.refined)
     refined = next(c for c in CONDITIONS if c.refined)
