@@ -29,6 +29,7 @@ from spike4dgs.method.images.training import (
 )
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent, Motion
+from spike4dgs.method.pace import at_pace
 from spike4dgs.method.pose_refinement import REFINEMENT
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.self_calibration.from_clip import as_in_clip
@@ -185,7 +186,7 @@ class RecipeMethod(Shown):
     ) -> Model:
         """Fit from given cameras and points, and images of other sensors where the recipe has these."""
         request.progress(0, 1, "images")
-        light, algorithm = None, self.algorithm
+        light, pace, algorithm = None, 1.0, self.algorithm
         if recorded:
             images = recorded_training_images(scene, start.cameras, recorded, request.device)
             if len(images.ticks) == 1 and self.recipe.motion not in self.parts.algorithms:
@@ -194,9 +195,13 @@ class RecipeMethod(Shown):
         else:
             maker = self.images.with_settings(settings.get("image_maker", self.images.settings))
             light = light_of(scene, algorithm.layers) if maker.knows_light else None
-            images = make_training_images(scene, start.cameras, maker, settings["images"], request.device, light)
+
+            def make(maker: ImageMaker, settings: ImageSettings) -> TrainingImages:
+                return make_training_images(scene, start.cameras, maker, settings, request.device, light)
+
+            images, settings, pace = at_pace(scene.id, maker, settings, make)
         key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])
-        extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]))
+        extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]), pace=pace)
         return algorithm.fit(FitJob(scene, start, images, extent, settings, request, key, light))
 
     def _static(self, settings: Mapping[str, Any]) -> tuple[Algorithm, Mapping[str, Any]]:

@@ -23,7 +23,8 @@ in the same way.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -53,6 +54,10 @@ class IntervalSettings(AdaptiveSettings):
         super().__post_init__()
         if not (self.half >= self.shortest and self.still > 0):
             raise problem("intervals", "half not below shortest, still above 0", str(self), "correct the settings")
+
+    def denser(self, pace: float) -> Self:
+        """Return settings whose spans are so many times shorter, but never below the shortest."""
+        return replace(self, half=max(self.shortest, self.half / pace))
 
 
 def half_spans(n_ticks: int, settings: IntervalSettings) -> Float32:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -32,6 +33,10 @@ class ImageSettings(Settings):
     edge_ticks: int = 10  # windows nearer to the clip's ends are cut, and their images belong to a later time
     max_times: int = 256  # bounds memory: 256 times x 8 views of 250x400 are 0.8 GB
     flat_field: bool = False  # correct the images by each camera's calibrated gain n(x, y) and dark rate, if known
+
+    def denser(self, pace: float) -> Self:
+        """Return settings with so many times as many images."""
+        return replace(self, time_spacing_ticks=max(1, round(self.time_spacing_ticks / pace)))
 
 
 def wanted_images(n_ticks: int, settings: ImageSettings) -> float:

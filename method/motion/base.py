@@ -27,6 +27,7 @@ class Extent:
     n_ticks: int
     width: int  # px of a view
     images: float = math.inf  # of a view over the clip, about; a saved model has no use for it
+    pace: float = 1.0  # times that motion is faster than about a pixel from image to image; nor for this
 
 
 class Motion(nn.Module):

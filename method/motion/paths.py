@@ -10,6 +10,7 @@ lack is added to them, for as long as they are seen.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -31,6 +32,7 @@ class PathSettings(PolynomialSettings):
 
     lr_coefficients: float = 1.4e-3  # of the polynomials, in scene scales a clip
     lr_coefficients_last: float = 1.4e-4
+    in_pace: bool = True  # images and pieces follow fast motion, see `method.pace`
     coherence: float = 0.01  # of neighbours' paths: white a pixel, for a departure of one pixel at the clip's ends
 
 
@@ -45,9 +47,11 @@ class Paths(PolynomialMotion):
     def pieces(self) -> int:
         """About 20 ms each, what a cubic can follow, or longer where images are too far apart for that.
 
-        The cost of rendering does not grow with the clip.
+        The cost of rendering does not grow with the clip. Where motion is faster, pieces are at least as much shorter.
         """
-        return 2 * round((min(self.extent.n_ticks / PIECE_TICKS, self.extent.images / PIECE_IMAGES) - 1) / 2) + 1
+        e = self.extent
+        count = min(e.n_ticks * e.pace / PIECE_TICKS, e.images / PIECE_IMAGES)
+        return 2 * (math.ceil if e.pace > 1 else round)((count - 1) / 2) + 1
 
     @property
     def coherence(self) -> float:

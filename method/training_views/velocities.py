@@ -43,7 +43,7 @@ def velocities_at(points: Tensor, images: TrainingImages, ticks: float) -> Tenso
     before, middle, after = trio
     values = in_mean_light(images).images[list(trio)].cpu().numpy()
     span = (images.ticks[after] - images.ticks[before]) / 2
-    flows = torch.from_numpy(np.stack([_flow(*values[:, c]) for c in range(values.shape[1])])).double()
+    flows = torch.from_numpy(np.stack([mean_flow(*values[:, c]) for c in range(values.shape[1])])).double()
     if images.missing is not None:
         flows[images.missing[list(trio)].any(0).cpu()] = torch.nan
     views = images.views.to(torch.device("cpu"))
@@ -58,7 +58,7 @@ def _three_images(images: TrainingImages, ticks: float) -> tuple[int, int, int] 
     return (before, middle, after) if before < middle < after else None
 
 
-def _flow(before: Float32, middle: Float32, after: Float32) -> Float32:
+def mean_flow(before: Float32, middle: Float32, after: Float32) -> Float32:
     """Return the mean flow [2, H, W] in px towards `after` and away from `before`; NaN where both differ."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)  # to the pixel
