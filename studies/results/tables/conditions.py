@@ -120,7 +120,7 @@ def _seeds(names: Sequence[str], own: Sequence[Record]) -> list[str]:
     for name in names:
         rows = [row for scene in GROUP.scenes for row in rows_of([name], (scene,), own) if len(row.seeds) > 1]
         values = [(row.values("psnr"), row.values(RANKED_BY)) for row in rows]
-        variances = [[np.var(v[0], ddof=1) for v in both] for both in values if all(both)]
+        variances = [[np.var(v[0], ddof=1) for v in (a, b)] for a, b in values if a and b]
         if variances:
             deviations = " / ".join(f"{d:.2f}" for d in np.sqrt(np.mean(variances, axis=0)))
             seeds = max(len(row.seeds) for row in rows)
