@@ -223,8 +223,10 @@ class RecipeMethod(Shown):
 
 def short(settings: SettingsByPart) -> dict[str, Settings]:
     """Return settings with three images of each view of the made scene, and a step or a few in each stage."""
-    images: Any = settings["images"]
-    return scaled({**settings, "images": replace(images, time_spacing_ticks=30)}, 0.005)
+    parts: Mapping[str, Any] = settings
+    own = {"in_pace": False} if hasattr(parts["motion"], "in_pace") else {}  # few images are far apart
+    few = {"images": replace(parts["images"], time_spacing_ticks=30), "motion": replace(parts["motion"], **own)}
+    return scaled({**parts, **few}, 0.005)
 
 
 def describe(recipe: Recipe, parts: Parts, algorithm: Algorithm) -> str:
