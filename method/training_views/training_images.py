@@ -52,6 +52,9 @@ class TrainingImages:
             image = image.masked_fill(self.bad, math.nan)
         if self.missing is not None:
             image = image.masked_fill(self.missing[index][:, None, None], math.nan)
+        if self.spans is not None:  # before a pixel's first spike and after its last, a span is of another time
+            first, last = self.spans.at(index).ends.unbind(1)
+            image = image.masked_fill((first > 0) | (last < 0), math.nan)
         return image
 
     def at(self, index: int) -> TrainingImages:
