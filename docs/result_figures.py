@@ -118,7 +118,8 @@ def conditions(out: Path) -> None:
         for k, planned in enumerate(on_conditions.GROUP.rows):
             rows = {x: rows_of([planned.name], known[name].scenes, records)[0] for x, name in levels.items()}
             there = {x: row.mean(RANKED_BY) for x, row in rows.items() if row.is_complete}
-            axes.plot(list(there), list(there.values()), "o-", color=method_color(k), label=planned.name)
+            if there:
+                axes.plot(list(there), list(there.values()), "o-", color=method_color(k), label=planned.name)
         axes.set_xscale("log")
         axes.set_xticks(list(levels), [f"{x:g}" if x >= 1 else f"1/{1 / x:g}" for x in levels])
         axes.minorticks_off()
