@@ -5,9 +5,9 @@ from __future__ import annotations
 import gc
 import os
 
-# Workers share the cores. OpenMP's threads must sleep while they wait, or they take the cores from other workers; and
-# of two threads on a busy core one waits for the other at every step of an optimiser.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+import spike4dgs.benchmark  # noqa: F401  before NumPy and torch: it says how OpenMP waits, and OpenBLAS's kernels
+
+# Workers share the cores: of two threads on a busy core one waits for the other at every step of an optimiser.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     gc.disable()  # until the tests are collected
