@@ -26,6 +26,7 @@ from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
 from spike4dgs.studies.results.records import read_records
 from spike4dgs.studies.results.tables import conditions as on_conditions
+from spike4dgs.studies.results.tables.conditions import rows_under
 from spike4dgs.studies.results.tables.modality import plot_modality
 from spike4dgs.studies.results.tables.published import given_row
 
@@ -47,6 +48,7 @@ LEVELS = {  # of a panel: its axis -> the names of conditions, by amount
     "light": {1 / 64: "light 1/64", 1 / 16: "light 1/16", 1 / 4: "light 1/4", 1: "none", 2: "light times 2"},
     "speed": {1: "none", 2: "twice as fast", 4: "four times as fast"},
     "length of the clip, ms": {5: "5 ms", 20: "none", 100: "100 ms"},
+    "cameras": {3: "3 of 8 cameras", 5: "5 of 8 cameras", 8: "none"},
 }
 SHEET_WIDTH = 1500  # pixels
 
@@ -109,14 +111,14 @@ def modality(out: Path) -> None:
 
 
 def conditions(out: Path) -> None:
-    """Show PSNR where things move by the amount of light, the speed and the length of the clip, row by row."""
-    records = of_group(on_conditions.GROUP, list(read_records(RECORDS).values()))
+    """Show PSNR where things move by light, speed, length of the clip and number of cameras, row by row."""
+    records = list(read_records(RECORDS).values())
     known = {condition.name: condition for condition in on_conditions.CONDITIONS}
-    figure = new_figure((11, 4), "constrained")
+    figure = new_figure((13, 4), "constrained")
     panels = figure.subplots(1, len(LEVELS), sharey=True)
     for axes, (title, levels) in zip(panels, LEVELS.items(), strict=True):
         for k, planned in enumerate(on_conditions.GROUP.rows):
-            rows = {x: rows_of([planned.name], known[name].scenes, records)[0] for x, name in levels.items()}
+            rows = {x: rows_under([planned.name], known[name], records)[0] for x, name in levels.items()}
             there = {x: row.mean(RANKED_BY) for x, row in rows.items() if row.is_complete}
             if there:
                 axes.plot(list(there), list(there.values()), "o-", color=method_color(k), label=planned.name)

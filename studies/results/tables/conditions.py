@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 
 from spike4dgs.benchmark.runs.refinement import SUFFIX
+from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT
 from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.worlds import HARD
 from spike4dgs.studies.kit.timing import markdown
@@ -26,16 +27,22 @@ WORLDS = ("car-1", "turntable-2")
 
 @dataclass(frozen=True)
 class Condition:
-    """A condition, and the options of `make-dataset` that make it. `refined`: scored at the fitted held-out pose."""
+    """A condition, and the options of `make-dataset` that make it. `refined`: scored at the fitted held-out pose.
+
+    `split` is the scene's: some cameras of the array alone.
+    """
 
     name: str
     physics: str = ""
     ms: int | None = None  # the clip's length, if not that of the profile
     refined: bool = False
+    split: str = DEFAULT_SPLIT
 
     @property
     def options(self) -> str:
-        """The options of `make-dataset`."""
+        """The options of `make-dataset`, or of `run-benchmark` where cameras are left out."""
+        if self.split != DEFAULT_SPLIT:
+            return f"run-benchmark --split {self.split}"
         return self.physics if self.ms is None else f"{self.physics} --seconds {self.ms / 1000:g}".strip()
 
     @cached_property
@@ -64,6 +71,8 @@ CONDITIONS = (
     Condition("four times as fast", "--speed 4"),
     Condition("5 ms", ms=5),
     Condition("100 ms", ms=100),
+    Condition("5 of 8 cameras", split="views-5"),
+    Condition("3 of 8 cameras", split="views-3"),
     Condition("the array moves", "--array-motion 2 --array-rotation 60"),
 )
 GROUP = Group(
@@ -85,6 +94,12 @@ REFINED = Group(
     tuple(scene for condition in CONDITIONS if condition.refined for scene in condition.scenes),
     tuple(replace(row, name=f"{row.name}{SUFFIX}") for row in GROUP.rows),
 )
+VIEWS = tuple(
+    replace(GROUP, name=f"conditions-{condition.split}", scenes=condition.scenes, split=condition.split)
+    for condition in CONDITIONS
+    if condition.split != DEFAULT_SPLIT
+)
+_EVERY = (GROUP, REFINED, *VIEWS)
 CONTENT = Group("content", "Hard content", tuple(f"{world}-1-small" for world in HARD), GROUP.rows)
 
 
@@ -93,13 +108,12 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
 
     Conditions that no row was measured under in both worlds are left out.
     """
-    own = of_group(GROUP, records)
+    own = [record for group in _EVERY for record in of_group(group, records)]
     if not own:
         return [NOTHING]
-    own += of_group(REFINED, records)
     there = {r["row"] for r in own}
     names = [row.name for row in GROUP.rows if row.name in there]
-    first, *others = (_rows(names, condition, own) for condition in CONDITIONS)
+    first, *others = (rows_under(names, condition, own) for condition in CONDITIONS)
     lines = [[CONDITIONS[0].name, "", *map(both_text, first)]]
     lines += [
         [condition.name, f"`{condition.options}`", *map(change_text, rows, first)]
@@ -111,12 +125,12 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         "others its change."
     )
-    return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, GROUP, REFINED)]
+    return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *_EVERY)]
 
 
 def _seeds(names: Sequence[str], own: Sequence[Record]) -> list[str]:
     """Return a sentence for each row with several seeds: how far they move a scene's values, pooled over scenes."""
-    sentences = []
+    sentences, own = [], of_group(GROUP, own)
     for name in names:
         rows = [row for scene in GROUP.scenes for row in rows_of([name], (scene,), own) if len(row.seeds) > 1]
         values = [(row.values("psnr"), row.values(RANKED_BY)) for row in rows]
@@ -130,9 +144,10 @@ def _seeds(names: Sequence[str], own: Sequence[Record]) -> list[str]:
     return sentences
 
 
-def _rows(names: Sequence[str], condition: Condition, own: Sequence[Record]) -> list[MeasuredRow]:
-    """Return rows on a condition's scenes, those with refined held-out poses where it asks for them."""
+def rows_under(names: Sequence[str], condition: Condition, records: Sequence[Record]) -> list[MeasuredRow]:
+    """Return rows on a condition's scenes and split, those with refined held-out poses where it asks for them."""
     suffix = SUFFIX if condition.refined else ""
+    own = [record for record in records if record["split"] == condition.split]
     return rows_of([f"{name}{suffix}" for name in names], condition.scenes, own)
 
 

@@ -27,6 +27,7 @@ from spike4dgs.studies.results.tables.conditions import (
     CONDITIONS,
     CONTENT,
     REFINED,
+    VIEWS,
     WORLDS,
     conditions_block,
     content_block,
@@ -270,7 +271,8 @@ def test_pairs_count_the_scenes_on_which_the_first_is_ahead():
 
 
 def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_worlds_are_measured():
-    assert len(ON_CONDITIONS.scenes) == len(WORLDS) * sum(not c.refined for c in CONDITIONS)
+    own = [c for c in CONDITIONS if not c.refined and c.split == "center"]
+    assert len(ON_CONDITIONS.scenes) == len(WORLDS) * len(own)
     assert "car-1-small-reset-read-dead" in ON_CONDITIONS.scenes and "turntable-2-small" in ON_CONDITIONS.scenes
     first, lens, blur = (condition.scenes for condition in CONDITIONS[:3])
     found = [record(OURS, s, 30.0 + k) for k, s in enumerate(first)]
@@ -280,6 +282,19 @@ def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_wor
     assert lines[2] == "| none |  | 32.50 / 30.50 | - |"
     assert lines[3].endswith("| -2.00 / -2.00 | - |") and not lines[4], "the blur has been measured in one world"
     assert "6 of" in lines[-1]
+
+
+def test_fewer_cameras_are_a_condition_of_the_undisturbed_scenes():
+    first = CONDITIONS[0].scenes
+    found = [record(OURS, s, 30.0, split=split) for s in first for split in ("center", "views-3", "views-5", "views-4")]
+    found = [r | {"metrics": r["metrics"] | {"psnr": 22.0}} if r["split"] == "views-3" else r for r in found]
+    lines = conditions_block(found)
+    assert lines[3:5] == [
+        "| 5 of 8 cameras | `run-benchmark --split views-5` | +0.00 / +0.00 |",
+        "| 3 of 8 cameras | `run-benchmark --split views-3` | -10.00 / +0.00 |",
+    ]
+    assert [(v.name, v.scenes) for v in VIEWS] == [("conditions-views-5", first), ("conditions-views-3", first)]
+    assert "6 of" in lines[-1], "four of eight cameras are no condition of the plan"
 
 
 def test_conditions_say_how_much_depends_on_the_seed():
