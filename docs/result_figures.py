@@ -26,6 +26,7 @@ from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
 from spike4dgs.studies.results.records import read_records
 from spike4dgs.studies.results.tables import conditions as on_conditions
+from spike4dgs.studies.results.tables.ceilings import ceiling_row
 from spike4dgs.studies.results.tables.conditions import rows_under
 from spike4dgs.studies.results.tables.modality import plot_modality
 from spike4dgs.studies.results.tables.published import given_row
@@ -122,6 +123,8 @@ def conditions(out: Path) -> None:
             there = {x: row.mean(RANKED_BY) for x, row in rows.items() if row.is_complete}
             if there:
                 axes.plot(list(there), list(there.values()), "o-", color=method_color(k), label=planned.name)
+        noise = {x: ceiling_row(known[name].scenes, records).mean(RANKED_BY) for x, name in levels.items()}
+        axes.plot(list(noise), list(noise.values()), "k--", lw=0.8, label="noise of the truth")
         axes.set_xscale("log")
         axes.set_xticks(list(levels), [f"{x:g}" if x >= 1 else f"1/{1 / x:g}" for x in levels])
         axes.minorticks_off()

@@ -41,6 +41,8 @@ from spike4dgs.studies.results.records import (
     write_row,
 )
 from spike4dgs.studies.results.scenes import revisions_of
+from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
+from spike4dgs.studies.results.tables.ceilings import measure_ceiling
 from spike4dgs.studies.results.tables.images import SUFFIX as IMAGES
 from spike4dgs.studies.results.tables.images import measure_images
 from spike4dgs.studies.sensors import bits_per_second, sensors_of
@@ -96,7 +98,9 @@ def sweep(
         for cell in todo:
             if cell.row.endswith(IMAGES):
                 kept.keep(cell, measure_images(cell.row, scenes[cell.scene]))
-        _measure([cell for cell in todo if not cell.row.endswith(IMAGES)], methods, kept, console)
+            elif cell.row == CEILING:
+                kept.keep(cell, measure_ceiling(scenes[cell.scene]))
+        _measure([cell for cell in todo if not _needs_no_fit(cell.row)], methods, kept, console)
         failed = [r for r in map(records.get, map(_key, here)) if r and (r["error"] or "").startswith(FAILED)]
         left = sum(_key(cell) not in records for cell in cells)
         return Outcome(left, tuple(f"{r['row']} on {r['scene']}, seed {r['seed']}: {r['error']}" for r in failed))
@@ -117,6 +121,10 @@ def _open(cells: Iterable[Cell], folder: Path, console: Console) -> dict[str, Sc
     if missing:
         console.print(f"not in {folder}, left out: {', '.join(missing)}")
     return scenes
+
+
+def _needs_no_fit(row: str) -> bool:
+    return row.endswith(IMAGES) or row == CEILING
 
 
 def _key(cell: Cell) -> Key:

@@ -21,6 +21,7 @@ from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
 from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
+from spike4dgs.studies.results.tables.ceilings import ceiling_row, ceilings_of
 
 WORLDS = ("car-1", "turntable-2")
 
@@ -101,6 +102,8 @@ VIEWS = tuple(
 )
 _EVERY = (GROUP, REFINED, *VIEWS)
 CONTENT = Group("content", "Hard content", tuple(f"{world}-1-small" for world in HARD), GROUP.rows)
+CEILINGS = ceilings_of((*GROUP.scenes, *CONTENT.scenes))
+_CEILING = "noise of the truth"
 
 
 def conditions_block(records: Sequence[Record]) -> list[str]:
@@ -114,16 +117,17 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
     there = {r["row"] for r in own}
     names = [row.name for row in GROUP.rows if row.name in there]
     first, *others = (rows_under(names, condition, own) for condition in CONDITIONS)
-    lines = [[CONDITIONS[0].name, "", *map(both_text, first)]]
+    ceilings = [both_text(ceiling_row(condition.scenes, records)) for condition in CONDITIONS]
+    lines = [[CONDITIONS[0].name, "", *map(both_text, first), ceilings[0]]]
     lines += [
-        [condition.name, f"`{condition.options}`", *map(change_text, rows, first)]
-        for condition, rows in zip(CONDITIONS[1:], others, strict=True)
+        [condition.name, f"`{condition.options}`", *map(change_text, rows, first), ceiling]
+        for condition, rows, ceiling in zip(CONDITIONS[1:], others, ceilings[1:], strict=True)
         if any(row.is_complete for row in rows)
     ]
-    heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names))
+    heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names), _CEILING)
     legend = (
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
-        "others its change."
+        f"others its change; a prediction without error has the PSNR of the {_CEILING}."
     )
     return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *_EVERY)]
 
@@ -158,5 +162,6 @@ def content_block(records: Sequence[Record]) -> list[str]:
     if not rows:
         return [NOTHING]
     lines = [[f"`{row.name}`", *(psnr_texts(row, scene) for scene in CONTENT.scenes)] for row in rows]
-    legend = "PSNR of the whole image / where things move, dB."
+    lines += [[_CEILING, *(psnr_texts(ceiling_row((scene,), records), scene) for scene in CONTENT.scenes)]]
+    legend = f"PSNR of the whole image / where things move, dB. A prediction without error has that of the {_CEILING}."
     return [*markdown(("row", *HARD), lines), "", legend, "", provenance(own, CONTENT)]

@@ -278,9 +278,12 @@ def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_wor
     found = [record(OURS, s, 30.0 + k) for k, s in enumerate(first)]
     found += [record(OURS, s, 29.0 - k) for k, s in enumerate(lens)]
     found += [record(OURS, blur[0], 25.0), record("tfp+stg", first[0], 25.0)]
+    found += [record("truth.noise", s, 53.0) for s in lens]
     lines = conditions_block(found)
-    assert lines[2] == "| none |  | 32.50 / 30.50 | - |"
-    assert lines[3].endswith("| -2.00 / -2.00 | - |") and not lines[4], "the blur has been measured in one world"
+    assert lines[2] == "| none |  | 32.50 / 30.50 | - | - |"
+    assert lines[3].endswith("| -2.00 / -2.00 | - | 55.00 / 53.00 |") and not lines[4], (
+        "the blur has been measured in one world"
+    )
     assert "6 of" in lines[-1]
 
 
@@ -290,8 +293,8 @@ def test_fewer_cameras_are_a_condition_of_the_undisturbed_scenes():
     found = [r | {"metrics": r["metrics"] | {"psnr": 22.0}} if r["split"] == "views-3" else r for r in found]
     lines = conditions_block(found)
     assert lines[3:5] == [
-        "| 5 of 8 cameras | `run-benchmark --split views-5` | +0.00 / +0.00 |",
-        "| 3 of 8 cameras | `run-benchmark --split views-3` | -10.00 / +0.00 |",
+        "| 5 of 8 cameras | `run-benchmark --split views-5` | +0.00 / +0.00 | - |",
+        "| 3 of 8 cameras | `run-benchmark --split views-3` | -10.00 / +0.00 | - |",
     ]
     assert [(v.name, v.scenes) for v in VIEWS] == [("conditions-views-5", first), ("conditions-views-3", first)]
     assert "6 of" in lines[-1], "four of eight cameras are no condition of the plan"
@@ -315,7 +318,7 @@ def test_a_condition_with_refined_held_out_poses_has_the_scores_of_the_refined_r
     found = [record(OURS, s, 30.0) for s in first.scenes] + [record(OURS, s, 28.5) for s in poses.scenes]
     found += [record(f"{OURS}.refined", s, 29.75) for s in poses.scenes]
     lines = conditions_block(found)
-    assert [line.split(" | ")[2] for line in lines[3:5]] == ["-1.50 / -1.50 |", "-0.25 / -0.25 |"]
+    assert [line.split(" | ")[2] for line in lines[3:5]] == ["-1.50 / -1.50", "-0.25 / -0.25"]
 
 
 def test_hard_content_has_a_column_for_each_world():
@@ -323,10 +326,15 @@ def test_hard_content_has_a_column_for_each_world():
         record(OURS, "mirror-1-small", 30.0),
         record(OURS, "flash-1-small", 25.0),
         record("c", "flash-1-small", 1.0),
+        record("truth.noise", "blank-1-small", 52.0),
     ]
     lines = content_block(found)
     assert lines[0] == "| row | appear | beads | blank | flash | mirror | rain |"
-    assert lines[2:4] == [f"| `{OURS}` | - | - | - | 27.00 / 25.00 | 32.00 / 30.00 | - |", ""]
+    assert lines[2:5] == [
+        f"| `{OURS}` | - | - | - | 27.00 / 25.00 | 32.00 / 30.00 | - |",
+        "| noise of the truth | - | - | 54.00 / 52.00 | - | - | - |",
+        "",
+    ]
 
 
 def test_images_stand_beside_the_papers_order_corrected_and_not():

@@ -1,0 +1,37 @@
+"""Ceilings of scores: noise of a known size in the truth is found, where things move and elsewhere."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spike4dgs.benchmark.scene.images import write_exr
+from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.studies.results.tables.ceilings import measure_ceiling
+
+STILL, MOVING = 0.02, 0.04  # standard deviations of the noise that is added
+
+
+@pytest.mark.slow  # it renders
+def test_noise_of_a_known_size_in_the_truth_is_the_ceiling(tiny_data: Path, tmp_path: Path) -> None:
+    shutil.copytree(tiny_data / "car-0-tiny", root := tmp_path / "car-0-tiny")
+    scene = open_scene(root)
+    target = scene.targets[len(scene.targets) // 2]
+    truth, moving = scene.ground_truth(target), scene.moving(target)
+    noise = np.random.default_rng(0).normal(0, np.where(moving, MOVING, STILL)).astype(np.float32)
+    write_exr(root / f"images/{target.name}.exr", truth + noise, 0)
+    write_manifest(root)
+    squares = (np.clip(truth + noise, 0, 1) - np.clip(truth, 0, 1)) ** 2
+    found = measure_ceiling(open_scene(root))
+    assert found["error"] is None
+    assert found["metrics"]["psnr"] == pytest.approx(-10 * np.log10(squares.mean()), abs=0.5)
+    assert found["metrics"]["psnr_dynamic"] == pytest.approx(-10 * np.log10(squares[moving].mean()), abs=0.8)
+
+
+def test_a_scene_that_no_world_made_is_skipped(small_scene: Path) -> None:
+    found = measure_ceiling(open_scene(small_scene))
+    assert found["error"].startswith("skipped: ") and found["metrics"] == {}
