@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from dataclasses import replace as replaced
 from pathlib import Path
 
+import tyro
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.cli.options import RENDERERS, Renderers
 from spike4dgs.generators import make_dataset as scenes
 from spike4dgs.generators.make_dataset import SceneSettings
+from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.rendering.mitsuba_variant import choose_device
 
 DEFAULTS = SceneSettings()
@@ -21,6 +25,7 @@ def make_dataset(
     all: bool = False,
     out: Path = Path("data"),
     settings: OmitArgPrefixes[SceneSettings] = DEFAULTS,
+    also: tuple[str, ...] = (),
     renderers: OmitArgPrefixes[Renderers] = RENDERERS,
     audit: bool = False,
     replace: bool = False,
@@ -36,6 +41,9 @@ def make_dataset(
         worlds: Names of worlds, such as car turntable.
         all: Make all worlds but those that are hard by design: appear, beads, blank, flash, mirror, rain.
         out: Folder in which the scene folders appear.
+        also: Options of camera and light of further scenes of each world, such as light=0.25 lens=-0.2,0.03
+            "read-noise=0.006 dead-ticks=1". Scenes that differ in sensors, light, lost ticks or given poses alone are
+            rendered once.
         audit: Compare random ticks and ground truth with full renderings of 4 times the samples; see the report.
         replace: Make damaged scenes, and scenes with other settings, again.
         check: A folder of reference scenes, such as a release, or one scene folder. Scenes in OUT are made only where
@@ -52,9 +60,27 @@ def make_dataset(
     if not names:
         raise problem("worlds", "at least one world, or --all", "none", f"choose among {', '.join(WORLDS)}")
     chosen = list(names)
-    jobs = scenes.track_jobs(track, chosen, settings) if track else [settings.job(name) for name in chosen]
+    if track and also:
+        raise problem("--also", "no --track, which has its own camera", "both", "leave one out")
+    every = [settings, *(replaced(settings, physics=physics_of(options)) for options in also)]
+    jobs = scenes.track_jobs(track, chosen, settings) if track else [one.job(name) for name in chosen for one in every]
     choose_device(renderers.device)
     workers, scheduler = renderers.workers, renderers.scheduler
     return scenes.make_dataset(
         jobs, out, workers=workers, scheduler=scheduler, audit=audit, replace=replace, check=check
     )
+
+
+def physics_of(options: str) -> PhysicsOptions:
+    """Return options of camera and light that stand in one argument of --also: "NAME=VALUE NAME=VALUE,VALUE".
+
+    Raises UserError for what is none.
+    """
+    known = {field.name.replace("_", "-") for field in fields(PhysicsOptions)}
+    arguments = []
+    for option in options.split():
+        name, is_given, values = option.partition("=")
+        if name not in known:
+            raise problem("--also", "options of camera and light, such as light=0.25", repr(option), "correct it")
+        arguments += [f"--{name}", *(values.split(",") if is_given else [])]
+    return tyro.cli(PhysicsOptions, prog="make-dataset --also", args=arguments)

@@ -59,7 +59,7 @@ def submit_all(results: Mapping[Path, Path | None], **options: Any) -> int:
 
 def second_renderings_of(scene: Scene) -> Renderings | None:
     """Return second renderings of a target, as far as one of our worlds made the scene."""
-    from spike4dgs.generators.second_renderings import second_renderings  # Mitsuba, only where it renders
+    from spike4dgs.generators.truth import second_renderings  # Mitsuba, only where it renders
 
     return second_renderings(scene)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -27,6 +28,7 @@ from spike4dgs.generators.render_tasks import cameras_of, world_of
 from spike4dgs.generators.rendering.mitsuba_variant import pick_variant
 from spike4dgs.generators.scene_check import check_scenes, find_references
 from spike4dgs.generators.scene_maker import Maker
+from spike4dgs.generators.shared_rendering import SharingMaker, rendering_of
 
 T = TypeVar("T")
 _MOST_SECONDS = 60  # a length of 0.02 renders for minutes
@@ -133,11 +135,14 @@ def make_dataset(
 ) -> int:
     """Make the scenes that are absent as OUT/ID, each with a report OUT/ID.report.json of the time of its stages.
 
+    Scenes that differ by what cameras and light make of a rendering alone are rendered once.
     Existing scenes are checked and kept, or with `replace` made again. Equal jobs give equal bytes, with any number of
     workers (of this machine, or a dask.distributed scheduler's). With `audit` random ticks are compared with full
     renderings, and with `check` the scenes with those of the same id in that folder. Return 1 where one of these
     differs by more than noise.
     """
+    if twice := [name for name, count in Counter(job.id for job in jobs).items() if count > 1]:
+        raise problem("scenes", "each once", f"{twice[0]} twice", "leave one out")
     console = Console(highlight=False, soft_wrap=True)
     for variant in {job.variant: None for job in jobs if is_reserved(job.variant)}:
         console.print(f"variant {variant} is kept for hidden seasons: train nothing on it, and enter no scores of it")
@@ -164,8 +169,13 @@ def make_dataset(
                 raise problem("an array that moves", "a world in steady light", job.world, fix)
     with executor(workers, scheduler) as run:
         making = partial(_make, run=run, in_process=workers == 1 and scheduler is None, console=console)
+        renderings = Counter(map(rendering_of, jobs))
+        left = Counter(map(rendering_of, todo))
         for number, job in enumerate(todo, start=1):
-            making(job, out, with_audit=audit, which=f" ({number} of {len(todo)})" if len(todo) > 1 else "")
+            which = f" ({number} of {len(todo)})" if len(todo) > 1 else ""
+            left[rendering_of(job)] -= 1
+            shared = (renderings[rendering_of(job)] > 1, left[rendering_of(job)] == 0)
+            making(job, out, with_audit=audit, which=which, shared=shared)
 
         def make(job: Job, folder: Path) -> None:
             if not _is_done(job, folder, False):
@@ -174,12 +184,24 @@ def make_dataset(
         return check_scenes(jobs, out, references, make) if check else 0
 
 
-def _make(job: Job, out: Path, *, run: Run, in_process: bool, console: Any, with_audit: bool, which: str) -> None:
-    """Make one scene and its report."""
-    start = time.perf_counter()
+def _make(
+    job: Job,
+    out: Path,
+    *,
+    run: Run,
+    in_process: bool,
+    console: Any,
+    with_audit: bool,
+    which: str,
+    shared: tuple[bool, bool] = (False, False),
+) -> None:
+    """Make one scene and its report. `shared`: whether others have its rendering too, and whether they are all made."""
+    start, (has_others, is_last) = time.perf_counter(), shared
     with _stages(console, job.id + which) as watch:
-        maker = Maker(job, out, watch, run, with_audit, in_process)
+        maker = (SharingMaker if has_others else Maker)(job, out, watch, run, with_audit, in_process)
         folder = maker.make()
+    if isinstance(maker, SharingMaker) and is_last:
+        maker.forget()
     total = time.perf_counter() - start
     report = {"scene": job.id, "stages_s": maker.seconds, "total_s": round(total, 2), "settings": job.settings}
     plan = {"spacings_ticks": list(maker.plan.chain), "sub_ticks": maker.plan.sub_ticks, "keys": len(maker.plan.ticks)}

@@ -1,4 +1,4 @@
-"""The truth of a scene: ground truth on disk, and the audit of the radiance that the sensors received.
+"""The truth of a scene: ground truth on disk, its noise, and the audit of the radiance that the sensors received.
 
 `make-dataset --audit`: the error of the radiance that the sensors received, against full renderings.
 
@@ -14,6 +14,7 @@ its procedure changes in the mean is no noise, and is found by renderings of who
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,21 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening
 
 from spike4dgs.benchmark.scene.images import gray, read_exr, read_mask, write_exr, write_geometry, write_mask
-from spike4dgs.benchmark.scene.scene import Target
+from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
-from spike4dgs.generators.render_tasks import Truth, cameras_of, held_out_view, path_of, renderer_of, world_of
+from spike4dgs.generators.render_tasks import (
+    Truth,
+    cameras_of,
+    held_out_view,
+    path_of,
+    recorded_job,
+    renderer_of,
+    world_of,
+)
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.moving_array.renderer import MovingArrayRenderer, along
 from spike4dgs.generators.rendering.render import MultiViewRenderer
-from spike4dgs.generators.second_renderings import second_truth
 
 WholePaths = MultiViewRenderer | MovingArrayRenderer
 _MASK_GROW_PX = 2
@@ -82,6 +90,7 @@ def moving_region(
 
 _TICKS, _VIEWS, _FRAMES, _PAIRS = 4, 3, 3, 3
 _SEEDS = (3_000_017, 5_000_011)  # added to a scene's seed: far from those of its own files
+_SECOND_SEEDS = (1_000_003, 2_000_003)  # the same, of the renderings beside a scored image
 _MORE = 4  # times the samples of a key or of ground truth
 _FLOOR = 0.02  # relative errors are in units of the true radiance, or of this where it is darker
 
@@ -236,3 +245,39 @@ def _total(rows: list[dict[str, Any]]) -> dict[str, float]:
     """Return the means over the rows."""
     keys = [k for k in rows[0] if isinstance(rows[0][k], float)]
     return {k: round(float(np.mean([r[k] for r in rows if k in r])), 5) for k in keys}
+
+
+def second_renderings(scene: Scene) -> tuple[Target, NDArray[np.float32], NDArray[np.float32]] | None:
+    """Return the middle target of the simulated held-out camera and two renderings of it, linear radiance [H, W].
+
+    Each has the noise of ground truth. None for a scene that no world of this installation made, and
+    for a split whose held-out cameras have no target of that camera.
+    """
+    job = recorded_job(scene.meta["source"])
+    if job is None:
+        return None
+    camera = cameras_of(job)[held_out_view(job)]
+    if not (targets := [t for t in scene.targets if t.camera == camera.id]):
+        return None
+    target, images = targets[len(targets) // 2], []
+    print(f"rendering a target of {scene.id} twice more, to know its noise: about half a minute", file=sys.stderr)
+    for seed in _SECOND_SEEDS:
+        rendered = second_truth(job, held_out_view(job), job.seed + seed)
+        images.append(rendered(target.tick / RATE_HZ) * np.float32(job.light_at(target.tick)))
+    return target, images[0], images[1]
+
+
+def second_truth(job: Job, view: int, seed: int) -> Callable[[float], NDArray[np.float32]]:
+    """Return what renders a view [H, W] at a time in seconds with the noise of ground truth and other random numbers.
+
+    All that is systematic is that of ground truth: where light is split, a background of the rig, and maps that its
+    views share. Where paths are whole, views share nothing, and every pixel is traced.
+    """
+    alike: dict[str, Any] = {"truth": True, "color": False, "seed": seed}
+    camera = cameras_of(job)[view : view + 1]
+    if job.profile.soft is None:
+        whole = renderer_of(job, camera, **alike, whole_frames=True)
+        return lambda t_s: whole.crn_frames(t_s)[0]
+    every: Any = renderer_of(job, cameras_of(job), **alike)
+    one = renderer_of(job, camera, **alike, static=every.static.views([view]), maps_of=lambda: every)
+    return lambda t_s: one.keys(t_s)[0]

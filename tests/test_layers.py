@@ -27,7 +27,7 @@ ORDER = {
     "benchmark": "errors arrays lazy plugins variants json_values files compilation schemas untrusted croissant "
     "environment weights screen spikes scene exchange release metrics method runs reports",
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
-    "second_renderings truth held_frames previews scene_maker scene_differences scene_check make_dataset",
+    "truth held_frames previews scene_maker shared_rendering scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat array_path gaussians training_views motion supervision "
     "pose_refinement schedule models checkpoint msdi images matching starts self_calibration trainer tuned pace fit "
     "recipes viewing recordings",

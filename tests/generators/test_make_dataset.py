@@ -15,7 +15,8 @@ from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
 from spike4dgs.cli.make_dataset import make_dataset as command
-from spike4dgs.generators import scene_maker
+from spike4dgs.cli.make_dataset import physics_of
+from spike4dgs.generators import scene_maker, streams
 from spike4dgs.generators.make_dataset import SceneSettings, make_dataset, track_jobs
 from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.profiles import PROFILES, TRACKS, Job
@@ -104,6 +105,71 @@ def test_resumes_after_an_interruption_at_every_step(fake, tmp_path):
             (hidden / ".000020.99.part.exr").write_bytes(b"left by a killed process")
     assert stops >= 8
     assert files_in(folder) == whole
+
+
+ALSO = ("light=0.25 pose-noise-deg=0.1", "lost-ticks=0.05", "flicker=0.08", "warming-k=8 read-noise=0.01")
+
+
+def count_keys(monkeypatch):
+    """Return a list that grows by each key that is rendered."""
+    rendered, before = [], FakeRenderer.key_arrays
+    monkeypatch.setattr(FakeRenderer, "key_arrays", lambda *args: (rendered.append(args[1]), before(*args))[1])
+    return rendered
+
+
+def test_scenes_of_one_rendering_are_rendered_once_and_equal_those_made_alone(fake, monkeypatch, tmp_path):
+    rendered = count_keys(monkeypatch)
+    alone = [SceneSettings(profile="tiny").job("car")]
+    alone += [SceneSettings(profile="tiny", physics=physics_of(options)).job("car") for options in ALSO]
+    for job in alone:
+        make_dataset([job], tmp_path / "alone")
+    each = len(rendered) // len(alone)
+    assert each and len(rendered) == each * len(alone)
+    rendered.clear()
+    command(("car",), settings=SceneSettings(profile="tiny"), also=ALSO, out=tmp_path / "together")
+    assert len(rendered) == each
+    assert {path.name for path in (tmp_path / "together").glob("car*") if path.is_dir()} == {job.id for job in alone}
+    for job in alone:
+        assert files_in(tmp_path / "together" / job.id) == files_in(tmp_path / "alone" / job.id)
+    assert not (tmp_path / "together" / ".work").exists()
+
+
+def test_what_changes_the_radiance_is_rendered_anew_and_a_killed_run_goes_on_with_what_is_shared(
+    fake, monkeypatch, tmp_path
+):
+    rendered, simulate = count_keys(monkeypatch), streams.write_camera
+    jobs = [SceneSettings(profile="tiny", physics=physics_of(o)).job("car") for o in ("", "psf-px=0.5", "light=2")]
+
+    def cut(scene, job, *others):
+        if job.physics.light == 2:
+            raise Stop
+        simulate(scene, job, *others)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(streams, "write_camera", cut)
+        with pytest.raises(Stop):
+            make_dataset(jobs, tmp_path)
+    assert len(rendered) == len(set(rendered)) * 2, "the blur is rendered, the light is not"
+    rendered.clear()
+    make_dataset(jobs, tmp_path)
+    assert not rendered and not (tmp_path / ".work").exists()
+    assert not list(open_scene(tmp_path / "car-0-tiny-light2").manifest.problems())
+
+
+def test_options_of_further_scenes_are_those_of_camera_and_light(fake, tmp_path):
+    lens, flag = physics_of("lens=-0.2,0.03 lens-spread=0.5"), physics_of("noisy-others")
+    assert lens == PhysicsOptions(lens=(-0.2, 0.03), lens_spread=0.5) and flag == PhysicsOptions(noisy_others=True)
+    for wrong in ("seconds=0.1", "--light=2", "0.25"):
+        with pytest.raises(UserError, match=f"--also: expected options of camera and light.*found '{wrong}'"):
+            command(("car",), settings=SceneSettings(profile="tiny"), also=(wrong,), out=tmp_path)
+    with pytest.raises(UserError, match="--light"):
+        command(("car",), settings=SceneSettings(profile="tiny"), also=("light=-1",), out=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_scene_is_not_made_twice_in_one_call(fake, tmp_path):
+    with pytest.raises(UserError, match="car-0-tiny twice"):
+        command(("car",), settings=SceneSettings(profile="tiny"), also=("light=1",), out=tmp_path)
 
 
 def test_other_settings_do_not_reuse_unfinished_work(fake, tmp_path):

@@ -101,7 +101,7 @@ def with_noise(done: Path) -> None:
 
 def enter_checked(done: Path, name: str) -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spike4dgs.generators.second_renderings.second_renderings", second)
+        patch.setattr("spike4dgs.generators.truth.second_renderings", second)
         enter(done, name)
     rows = {r["method"]: r for r in board(done, "leaderboard")["boards"][0]["rows"]}
     return dict(rows[name])

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.generators.second_renderings import second_renderings
+from spike4dgs.generators.truth import second_renderings
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db
 from spike4dgs.studies.results.blocks import of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of

@@ -9,7 +9,7 @@ from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.generators.profiles import RATE_HZ, SPLIT_PROFILES, Job
 from spike4dgs.generators.render_tasks import RenderTargets, cameras_of, renderer_of
-from spike4dgs.generators.second_renderings import second_renderings, second_truth
+from spike4dgs.generators.truth import second_renderings, second_truth
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db, noise_share
 
 

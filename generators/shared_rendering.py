@@ -1,0 +1,73 @@
+"""Scenes that differ by what cameras and light make of a rendering alone: it is rendered once for all of them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from spike4dgs.benchmark.files import sha256_json
+from spike4dgs.generators.physics import Physics
+from spike4dgs.generators.profiles import Job
+from spike4dgs.generators.scene_maker import Maker
+
+# The physics that change no radiance, and of ground truth the light alone. A new one is shared once it stands here.
+AFTERWARDS = (
+    "pose_noise_deg",
+    "pose_noise_m",
+    "flicker",
+    "flicker_hz",
+    "flicker_duty",
+    "warming_k",
+    "reset_noise",
+    "read_noise",
+    "dead_ticks",
+    "clock_ripple",
+    "light",
+    "lost_ticks",
+    "noisy_others",
+)
+
+
+def rendering_of(job: Job) -> Job:
+    """Return a job that stands for all jobs of its rendering."""
+    physics = replace(job.physics, **{f.name: f.default for f in fields(Physics) if f.name in AFTERWARDS})
+    return replace(job, physics=physics, gain_map=True, dark_map=True, shot_noise=True)
+
+
+@dataclass
+class SharingMaker(Maker):
+    """A maker that takes the rendering of its scene from OUT/.work, or leaves it there for the next one.
+
+    Who makes the last scene of a rendering calls `forget`.
+    """
+
+    def _open_work(self) -> None:
+        if self._shared.is_dir() and not self._work.exists():
+            self._link(self._shared, self._work)
+        super()._open_work()
+
+    def _simulate(self) -> None:
+        if not self._shared.exists():
+            self._link(self._work, self._shared)
+        super()._simulate()
+
+    def forget(self) -> None:
+        """Remove what scenes of this rendering share."""
+        shutil.rmtree(self._shared, ignore_errors=True)
+        if not any(self._shared.parent.iterdir()):
+            self._shared.parent.rmdir()
+
+    @property
+    def _shared(self) -> Path:
+        key = sha256_json([rendering_of(self.job).settings, self._versions])
+        return self.out / ".work" / f"rendering-{key[:12]}"
+
+    def _link(self, source: Path, destination: Path) -> None:
+        """Link the files of a work folder elsewhere: keys, backgrounds and, where the light is steady, ground truth."""
+        left_out = ["settings.json", *(["scene"] if self.job.flicker else [])]
+        part = destination.with_name(f"{destination.name}.part")
+        shutil.rmtree(part, ignore_errors=True)
+        shutil.copytree(source, part, copy_function=os.link, ignore=shutil.ignore_patterns(*left_out))
+        os.rename(part, destination)
