@@ -88,8 +88,9 @@ def sweep(
             held.enter_context(locked(lock, folder, "a folder that no other sweep uses", temporary=True))
             remove_parts(folder)
         records = read_records(settings.records)
-        revisions = revisions_of(scenes.values(), records.values(), settings.records, console)
-        here = [cell for cell in cells if cell.scene in scenes]
+        each = {scene.id: scene for scene in scenes.values()}
+        revisions = revisions_of(each.values(), records.values(), settings.records, console)
+        here = [cell for cell in cells if _place(cell) in scenes]
         todo = [cell for cell in here if not _is_done(records.get(_key(cell)), settings.quiet)]
         console.print(f"{len(cells)} cells planned, {len(here) - len(todo)} measured, {len(todo)} to measure")
         codes = {name: code_digest(name) for name in dict.fromkeys(cell.row for cell in here)}
@@ -97,30 +98,34 @@ def sweep(
         kept = _Kept(scenes, revisions, codes, state, settings, records)
         for cell in todo:
             if cell.row.endswith(IMAGES):
-                kept.keep(cell, measure_images(cell.row, scenes[cell.scene]))
+                kept.keep(cell, measure_images(cell.row, scenes[_place(cell)]))
             elif cell.row == CEILING:
-                kept.keep(cell, measure_ceiling(scenes[cell.scene]))
+                kept.keep(cell, measure_ceiling(scenes[_place(cell)]))
         _measure([cell for cell in todo if not _needs_no_fit(cell.row)], methods, kept, console)
         failed = [r for r in map(records.get, map(_key, here)) if r and (r["error"] or "").startswith(FAILED)]
         left = sum(_key(cell) not in records for cell in cells)
         return Outcome(left, tuple(f"{r['row']} on {r['scene']}, seed {r['seed']}: {r['error']}" for r in failed))
 
 
-def _open(cells: Iterable[Cell], folder: Path, console: Console) -> dict[str, Scene]:
-    """Open the scenes of the plan that are there, and check what a fit reads of them."""
-    scenes: dict[str, Scene] = {}
-    wanted = {cell.scene: cell.split for cell in cells}
-    for name, split in wanted.items():
+def _open(cells: Iterable[Cell], folder: Path, console: Console) -> dict[tuple[str, str], Scene]:
+    """Open the scenes of the plan that are there, in each split, and check what a fit reads of them."""
+    scenes: dict[tuple[str, str], Scene] = {}
+    wanted = dict.fromkeys(map(_place, cells))
+    for name, split in wanted:
         if (folder / name).is_dir():
-            scenes[name] = open_scene(folder / name, allow_gaps=True, split=split)
-            check_inputs(scenes[name])
-    missing = [name for name in wanted if name not in scenes]
+            scenes[name, split] = open_scene(folder / name, allow_gaps=True, split=split)
+            check_inputs(scenes[name, split])
     if not scenes:
         fix = "spike4dgs make-dataset --track ideal --out DIR, and --scenes-of DIR"
-        raise problem(folder, f"scenes of the plan, such as {next(iter(wanted), 'car-0-small')}", "none", fix)
-    if missing:
+        first = next((name for name, _ in wanted), "car-0-small")
+        raise problem(folder, f"scenes of the plan, such as {first}", "none", fix)
+    if missing := dict.fromkeys(name for name, split in wanted if (name, split) not in scenes):
         console.print(f"not in {folder}, left out: {', '.join(missing)}")
     return scenes
+
+
+def _place(cell: Cell) -> tuple[str, str]:
+    return cell.scene, cell.split
 
 
 def _needs_no_fit(row: str) -> bool:
@@ -148,7 +153,7 @@ def _say_other_code(
 class _Kept:
     """What is known of the cells, and their records so far."""
 
-    scenes: Mapping[str, Scene]
+    scenes: Mapping[tuple[str, str], Scene]  # by id and split
     revisions: Mapping[str, str]
     codes: Mapping[str, str]
     state: CodeState
@@ -163,7 +168,7 @@ class _Kept:
         if (found := code_digest(cell.row)) != self.codes[cell.row]:
             fix = "start again; a sweep needs a checkout that nobody edits"
             raise problem("the methods' code", self.codes[cell.row], f"{found}: it changed meanwhile", fix)
-        revision, own = self.revisions[cell.scene], self.scenes[cell.scene].revision[:DIGITS]
+        revision, own = self.revisions[cell.scene], self.scenes[_place(cell)].revision[:DIGITS]
         record: Record = {
             "row": cell.row,
             "scene": cell.scene,
@@ -191,7 +196,7 @@ def _measure(todo: Sequence[Cell], methods: Mapping[str, Method], kept: _Kept, c
         JobFiles(
             Job(
                 get_method(cell.row.removesuffix(REFINED), methods),
-                kept.scenes[cell.scene],
+                kept.scenes[_place(cell)],
                 cell.seed,
                 DEVICE,
                 make_budget(cell.budget),

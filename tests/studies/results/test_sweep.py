@@ -58,6 +58,18 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_one_scene_in_two_splits_has_the_scores_of_each_alone(tmp_path: Path) -> None:
+    splits, psnr = ("corner", "center"), {}
+    for name, chosen in {"both": splits, **{split: (split,) for split in splits}}.items():
+        write_small_scene(tmp_path / name / "pattern-0", splits=True)
+        planned = [replace(cell, split=split) for split in chosen for cell in cells("quick")]
+        outcome, records, _ = swept(tmp_path / name, planned, {"quick": CountMethod("quick")})
+        assert not outcome.left and not outcome.failed
+        psnr[name] = {record["split"]: record["metrics"]["psnr"] for record in records.values()}
+    assert psnr["both"] == psnr["corner"] | psnr["center"]
+    assert psnr["both"]["corner"] != psnr["both"]["center"]
+
+
 KILLED = """
 import sys; sys.path[:0] = sys.argv[1:3]
 from pathlib import Path
