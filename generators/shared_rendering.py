@@ -6,6 +6,7 @@ import os
 import shutil
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.generators.physics import Physics
@@ -32,8 +33,8 @@ AFTERWARDS = (
 
 def rendering_of(job: Job) -> Job:
     """Return a job that stands for all jobs of its rendering."""
-    physics = replace(job.physics, **{f.name: f.default for f in fields(Physics) if f.name in AFTERWARDS})
-    return replace(job, physics=physics, gain_map=True, dark_map=True, shot_noise=True)
+    without: dict[str, Any] = {f.name: f.default for f in fields(Physics) if f.name in AFTERWARDS}
+    return replace(job, physics=replace(job.physics, **without), gain_map=True, dark_map=True, shot_noise=True)
 
 
 @dataclass
