@@ -109,13 +109,13 @@ _CEILING = "noise of the truth"
 def conditions_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of the table: PSNR without a condition, and what each one changes, in dB, by row.
 
-    Conditions that no row was measured under in both worlds are left out.
+    Conditions that no row was measured under in both worlds are left out, and rows that were not measured without one.
     """
     own = [record for group in _EVERY for record in of_group(group, records)]
     if not own:
         return [NOTHING]
-    there = {r["row"] for r in own}
-    names = [row.name for row in GROUP.rows if row.name in there]
+    undisturbed = rows_under([row.name for row in GROUP.rows], CONDITIONS[0], own)
+    names = [row.name for row in undisturbed if row.is_complete]
     first, *others = (rows_under(names, condition, own) for condition in CONDITIONS)
     ceilings = [both_text(ceiling_row(condition.scenes, records)) for condition in CONDITIONS]
     lines = [[CONDITIONS[0].name, "", *map(both_text, first), ceilings[0]]]
