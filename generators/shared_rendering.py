@@ -46,12 +46,12 @@ class SharingMaker(Maker):
 
     def _open_work(self) -> None:
         if self._shared.is_dir() and not self._work.exists():
-            self._link(self._shared, self._work)
+            self._copy(self._shared, self._work)
         super()._open_work()
 
     def _simulate(self) -> None:
         if not self._shared.exists():
-            self._link(self._work, self._shared)
+            self._copy(self._work, self._shared)
         super()._simulate()
 
     def forget(self) -> None:
@@ -65,10 +65,10 @@ class SharingMaker(Maker):
         key = sha256_json([rendering_of(self.job).settings, self._versions])
         return self.out / ".work" / f"rendering-{key[:12]}"
 
-    def _link(self, source: Path, destination: Path) -> None:
-        """Link the files of a work folder elsewhere: keys, backgrounds and, where the light is steady, ground truth."""
+    def _copy(self, source: Path, destination: Path) -> None:
+        """Copy the files of a work folder elsewhere: keys, backgrounds and, where the light is steady, ground truth."""
         left_out = ["settings.json", *(["scene"] if self.job.flicker else [])]
         part = destination.with_name(f"{destination.name}.part")
         shutil.rmtree(part, ignore_errors=True)
-        shutil.copytree(source, part, copy_function=os.link, ignore=shutil.ignore_patterns(*left_out))
+        shutil.copytree(source, part, ignore=shutil.ignore_patterns(*left_out))
         os.rename(part, destination)

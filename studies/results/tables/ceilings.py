@@ -10,17 +10,11 @@ from collections.abc import Iterable, Sequence
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.generators.truth import second_renderings
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db
-from spike4dgs.studies.results.blocks import of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
-from spike4dgs.studies.results.plan import NOT_TUNED, UNCALIBRATED, Group, Row
+from spike4dgs.studies.results.plan import UNCALIBRATED
 from spike4dgs.studies.results.records import COSTS, Record, short
 
 ROW = "truth.noise"
-
-
-def ceilings_of(scenes: Iterable[str]) -> Group:
-    """Return the group of the scenes' ceilings."""
-    return Group("ceilings", "Noise of the truth", tuple(dict.fromkeys(scenes)), (Row(ROW, tuned_on=NOT_TUNED),))
 
 
 def measure_ceiling(scene: Scene) -> Record:
@@ -42,4 +36,4 @@ def measure_ceiling(scene: Scene) -> Record:
 
 def ceiling_row(scenes: Sequence[str], records: Iterable[Record]) -> MeasuredRow:
     """Return the ceilings of scenes as a row."""
-    return rows_of([ROW], scenes, of_group(ceilings_of(scenes), records))[0]
+    return rows_of([ROW], scenes, records)[0]

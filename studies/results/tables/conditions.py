@@ -19,9 +19,10 @@ from spike4dgs.generators.worlds import HARD
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance, psnr_texts
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
-from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
+from spike4dgs.studies.results.plan import NOT_TUNED, OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
-from spike4dgs.studies.results.tables.ceilings import ceiling_row, ceilings_of
+from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
+from spike4dgs.studies.results.tables.ceilings import ceiling_row
 
 WORLDS = ("car-1", "turntable-2")
 
@@ -102,8 +103,8 @@ VIEWS = tuple(
 )
 _EVERY = (GROUP, REFINED, *VIEWS)
 CONTENT = Group("content", "Hard content", tuple(f"{world}-1-small" for world in HARD), GROUP.rows)
-CEILINGS = ceilings_of((*GROUP.scenes, *CONTENT.scenes))
-_CEILING = "noise of the truth"
+CEILINGS = Group("ceilings", "Noise of the truth", (*GROUP.scenes, *CONTENT.scenes), (Row(CEILING, 1, NOT_TUNED),))
+_NOISE = "noise of the truth"
 
 
 def conditions_block(records: Sequence[Record]) -> list[str]:
@@ -124,10 +125,10 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         for condition, rows, ceiling in zip(CONDITIONS[1:], others, ceilings[1:], strict=True)
         if any(row.is_complete for row in rows)
     ]
-    heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names), _CEILING)
+    heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names), _NOISE)
     legend = (
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
-        f"others its change; a prediction without error has the PSNR of the {_CEILING}."
+        f"others its change; a prediction without error has the PSNR of the {_NOISE}."
     )
     return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *_EVERY)]
 
@@ -162,6 +163,6 @@ def content_block(records: Sequence[Record]) -> list[str]:
     if not rows:
         return [NOTHING]
     lines = [[f"`{row.name}`", *(psnr_texts(row, scene) for scene in CONTENT.scenes)] for row in rows]
-    lines += [[_CEILING, *(psnr_texts(ceiling_row((scene,), records), scene) for scene in CONTENT.scenes)]]
-    legend = f"PSNR of the whole image / where things move, dB. A prediction without error has that of the {_CEILING}."
+    lines += [[_NOISE, *(psnr_texts(ceiling_row((scene,), records), scene) for scene in CONTENT.scenes)]]
+    legend = f"PSNR of the whole image / where things move, dB. A prediction without error has that of the {_NOISE}."
     return [*markdown(("row", *HARD), lines), "", legend, "", provenance(own, CONTENT)]
