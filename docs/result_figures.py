@@ -1,7 +1,7 @@
 """Write figures of the results pages that no command writes: `python docs/result_figures.py FIGURE PATHS`.
 
 images STRIP OUT: of strip_SCENE.png of `speed images`. sensor SCENE OUT. conditions, modality and uncalibrated OUT: of
-the records. sheets SWEEP SCENES FOLDER, content SWEEP SCENES OUT: of the predictions of `report results` on the scenes.
+the records. sheets SWEEP SCENES FOLDER, hard SWEEP SCENES OUT: of the predictions of `report results` on the scenes.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from spike4dgs.benchmark.reports.panels import crops, make_panels
 from spike4dgs.benchmark.reports.sheet import make_sheet
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
 from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT
 from spike4dgs.studies.results.blocks import NINE, of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
@@ -51,6 +52,7 @@ LEVELS = {  # of a panel: its axis -> the names of conditions, by amount
     "length of the clip, ms": {5: "5 ms", 20: "none", 100: "100 ms"},
     "cameras": {3: "3 of 8 cameras", 5: "5 of 8 cameras", 8: "none"},
 }
+SHOWN_CONDITIONS = ("light 1/16", "four times as fast", "5 of 8 cameras")
 SHEET_WIDTH = 1500  # pixels
 
 
@@ -135,24 +137,29 @@ def conditions(out: Path) -> None:
     _save(figure, out)
 
 
-def content(sweep: Path, scenes: Path, out: Path) -> None:
-    """Show a crop of each world with hard content: truth, and what each row renders, at the middle of the clip."""
-    group = on_conditions.CONTENT
-    figure = new_figure((1.9 * (len(group.rows) + 1), 1.25 * len(group.scenes)), "constrained")
-    axes = figure.subplots(len(group.scenes), len(group.rows) + 1)
-    for k, name in enumerate(group.scenes):
+def hard(sweep: Path, scenes: Path, out: Path) -> None:
+    """Show a crop of what is hard: truth, and what each row renders at the middle of the clip, with its PSNR there."""
+    names = [row.name for row in on_conditions.GROUP.rows]
+    lines = [(name.partition("-")[0], name, DEFAULT_SPLIT) for name in on_conditions.CONTENT.scenes]
+    known = {condition.name: condition for condition in on_conditions.CONDITIONS}
+    lines += [(f"car, {name}", known[name].scenes[0], known[name].split) for name in SHOWN_CONDITIONS]
+    figure = new_figure((1.9 * (len(names) + 1), 1.35 * len(lines)), "constrained")
+    for axes, (title, name, split) in zip(figure.subplots(len(lines), len(names) + 1), lines, strict=True):
         scene = open_scene(scenes / name)
         target = scene.targets[len(scene.targets) // 2]
-        truth = scene.ground_truth(target)
-        (box,) = crops([scene.moving(target)])
-        folders = [_predictions(sweep, row.name, name) for row in group.rows]
+        truth, moving = scene.ground_truth(target), scene.moving(target)
+        (box,) = crops([moving])
+        assert box is not None, "something that moves"
+        folders = [_predictions(sweep, row, name, split) for row in names]
         images = [folder and read_exr(folder / f"{target.name}.exr", truth.shape) for folder in folders]
-        for j, image in enumerate((truth, *images)):
-            axes[k, j].set_axis_off()
-            if image is not None and box is not None:
-                axes[k, j].imshow(encode_srgb(box.of(image)), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-    for column, title in zip(axes[0], ("truth", *(row.name for row in group.rows)), strict=True):
-        column.set_title(title, fontsize=8)
+        for axis, row, image in zip(axes, ("truth", *names), (truth, *images), strict=True):
+            axis.set_axis_off()
+            if image is None:
+                continue
+            pair = ImagePair(image, truth, moving, target.name)
+            score = "" if image is truth else f": {measure(pair, None, [METRICS[RANKED_BY]]).values[RANKED_BY]:.1f} dB"
+            axis.set_title(title if image is truth else f"{row}{score}", fontsize=7)
+            axis.imshow(encode_srgb(box.of(image)), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     _save(figure, out, SHEET_WIDTH)
 
 
@@ -172,8 +179,8 @@ def sheets(sweep: Path, scenes: Path, out: Path) -> None:
         _save(make_sheet(make_panels(scene, folders, records)), out / f"{name.partition('-')[0]}.webp", SHEET_WIDTH)
 
 
-def _predictions(sweep: Path, row: str, scene: str) -> Path | None:
-    return next(sweep.glob(f"*/quick-center/seed-0/predictions/{row}/{scene}"), None)
+def _predictions(sweep: Path, row: str, scene: str, split: str = DEFAULT_SPLIT) -> Path | None:
+    return next(sweep.glob(f"*/quick-{split}/seed-0/predictions/{row}/{scene}"), None)
 
 
 def _scored(row: str, scene: Scene, folder: Path) -> dict[str, Any]:
@@ -203,7 +210,7 @@ def _as_webp(png: Path, out: Path, width: int | None = None) -> None:
 
 FIGURES = {
     "conditions": conditions,
-    "content": content,
+    "hard": hard,
     "images": images,
     "modality": modality,
     "sensor": sensor,

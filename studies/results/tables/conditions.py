@@ -31,7 +31,7 @@ WORLDS = ("car-1", "turntable-2")
 class Condition:
     """A condition, and the options of `make-dataset` that make it. `refined`: scored at the fitted held-out pose.
 
-    `split` is the scene's: some cameras of the array alone.
+    `split` is the scene's: some cameras of the array alone. `worlds` are those that it was made with.
     """
 
     name: str
@@ -39,6 +39,7 @@ class Condition:
     ms: int | None = None  # the clip's length, if not that of the profile
     refined: bool = False
     split: str = DEFAULT_SPLIT
+    worlds: tuple[str, ...] = WORLDS
 
     @property
     def options(self) -> str:
@@ -51,7 +52,7 @@ class Condition:
     def scenes(self) -> tuple[str, ...]:
         """The ids of its scenes, one for each world."""
         suffix = tyro.cli(PhysicsOptions, args=self.physics.split()).physics().suffix
-        return tuple(f"{world}-small{'' if self.ms is None else f'-{self.ms}ms'}{suffix}" for world in WORLDS)
+        return tuple(f"{world}-small{'' if self.ms is None else f'-{self.ms}ms'}{suffix}" for world in self.worlds)
 
 
 CONDITIONS = (
@@ -75,7 +76,7 @@ CONDITIONS = (
     Condition("100 ms", ms=100),
     Condition("5 of 8 cameras", split="views-5"),
     Condition("3 of 8 cameras", split="views-3"),
-    Condition("the array moves", "--array-motion 2 --array-rotation 60"),
+    Condition("the array moves, car-1 alone", "--array-motion 2 --array-rotation 60", worlds=("car-1",)),
 )
 GROUP = Group(
     "conditions",
@@ -117,20 +118,23 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         return [NOTHING]
     undisturbed = rows_under([row.name for row in GROUP.rows], CONDITIONS[0], own)
     names = [row.name for row in undisturbed if row.is_complete]
-    first, *others = (rows_under(names, condition, own) for condition in CONDITIONS)
-    ceilings = [both_text(ceiling_row(condition.scenes, records)) for condition in CONDITIONS]
-    lines = [[CONDITIONS[0].name, "", *map(both_text, first), ceilings[0]]]
-    lines += [
-        [condition.name, f"`{condition.options}`", *map(change_text, rows, first), ceiling]
-        for condition, rows, ceiling in zip(CONDITIONS[1:], others, ceilings[1:], strict=True)
-        if any(row.is_complete for row in rows)
-    ]
+    none, *others = CONDITIONS
+    lines = [[none.name, "", *map(both_text, rows_under(names, none, own)), _ceiling(none, records)]]
+    for condition in others:
+        rows, without = (rows_under(names, c, own) for c in (condition, replace(none, worlds=condition.worlds)))
+        if any(row.is_complete for row in rows):
+            changes = map(change_text, rows, without)
+            lines.append([condition.name, f"`{condition.options}`", *changes, _ceiling(condition, records)])
     heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names), _NOISE)
     legend = (
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         f"others its change; a prediction without error has the PSNR of the {_NOISE}."
     )
     return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *_EVERY)]
+
+
+def _ceiling(condition: Condition, records: Sequence[Record]) -> str:
+    return both_text(ceiling_row(condition.scenes, records))
 
 
 def _seeds(names: Sequence[str], own: Sequence[Record]) -> list[str]:

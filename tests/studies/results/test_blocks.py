@@ -272,7 +272,7 @@ def test_pairs_count_the_scenes_on_which_the_first_is_ahead():
 
 def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_worlds_are_measured():
     own = [c for c in CONDITIONS if not c.refined and c.split == "center"]
-    assert len(ON_CONDITIONS.scenes) == len(WORLDS) * len(own)
+    assert len(ON_CONDITIONS.scenes) == sum(len(condition.worlds) for condition in own)
     assert "car-1-small-reset-read-dead" in ON_CONDITIONS.scenes and "turntable-2-small" in ON_CONDITIONS.scenes
     first, lens, blur = (condition.scenes for condition in CONDITIONS[:3])
     found = [record(OURS, s, 30.0 + k) for k, s in enumerate(first)]
@@ -285,6 +285,14 @@ def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_wor
         "the blur has been measured in one world"
     )
     assert "6 of" in lines[-1]
+
+
+def test_a_condition_that_was_made_in_one_world_is_compared_with_that_world():
+    moves = next(c for c in CONDITIONS if c.worlds != WORLDS)
+    assert moves.worlds == ("car-1",) and moves.name.endswith("car-1 alone")
+    found = [record(OURS, s, psnr) for s, psnr in zip(CONDITIONS[0].scenes, (30.0, 50.0), strict=True)]
+    found += [record(OURS, moves.scenes[0], 28.0)]
+    assert conditions_block(found)[3].endswith(f"| `{moves.options}` | -2.00 / -2.00 | - |")
 
 
 def test_fewer_cameras_are_a_condition_of_the_undisturbed_scenes():
