@@ -150,15 +150,16 @@ def hard(sweep: Path, scenes: Path, out: Path) -> None:
         truth, moving = scene.ground_truth(target), scene.moving(target)
         (box,) = crops([moving])
         assert box is not None, "something that moves"
-        folders = [_predictions(sweep, row, name, split) for row in names]
-        images = [folder and read_exr(folder / f"{target.name}.exr", truth.shape) for folder in folders]
-        for axis, row, image in zip(axes, ("truth", *names), (truth, *images), strict=True):
+        shown = {title: truth}
+        for row in names:
+            if folder := _predictions(sweep, row, name, split):
+                image = read_exr(folder / f"{target.name}.exr", truth.shape)
+                scores = measure(ImagePair(image, truth, moving, target.name), None, [METRICS[RANKED_BY]]).values
+                shown[f"{row}: {scores[RANKED_BY]:.1f} dB"] = image
+        for axis in axes:
             axis.set_axis_off()
-            if image is None:
-                continue
-            pair = ImagePair(image, truth, moving, target.name)
-            score = "" if image is truth else f": {measure(pair, None, [METRICS[RANKED_BY]]).values[RANKED_BY]:.1f} dB"
-            axis.set_title(title if image is truth else f"{row}{score}", fontsize=7)
+        for axis, (title, image) in zip(axes, shown.items(), strict=False):
+            axis.set_title(title, fontsize=7)
             axis.imshow(encode_srgb(box.of(image)), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     _save(figure, out, SHEET_WIDTH)
 
