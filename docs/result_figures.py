@@ -13,6 +13,7 @@ from typing import Any
 from PIL import Image
 
 from spike4dgs.benchmark import open_scene
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.measure import measure
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -21,7 +22,7 @@ from spike4dgs.benchmark.reports.panels import crops, make_panels
 from spike4dgs.benchmark.reports.sheet import make_sheet
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT
+from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT, Target
 from spike4dgs.studies.results.blocks import NINE, of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
@@ -52,6 +53,7 @@ LEVELS = {  # of a panel: its axis -> the names of conditions, by amount
     "length of the clip, ms": {5: "5 ms", 20: "none", 100: "100 ms"},
     "cameras": {3: "3 of 8 cameras", 5: "5 of 8 cameras", 8: "none"},
 }
+CONDITIONS = {condition.name: condition for condition in on_conditions.CONDITIONS}
 SHOWN_CONDITIONS = ("light 1/16", "four times as fast", "5 of 8 cameras")
 SHEET_WIDTH = 1500  # pixels
 
@@ -116,16 +118,15 @@ def modality(out: Path) -> None:
 def conditions(out: Path) -> None:
     """Show PSNR where things move by light, speed, length of the clip and number of cameras, row by row."""
     records = list(read_records(RECORDS).values())
-    known = {condition.name: condition for condition in on_conditions.CONDITIONS}
     figure = new_figure((13, 4), "constrained")
     panels = figure.subplots(1, len(LEVELS), sharey=True)
     for axes, (title, levels) in zip(panels, LEVELS.items(), strict=True):
         for k, planned in enumerate(on_conditions.GROUP.rows):
-            rows = {x: rows_under([planned.name], known[name], records)[0] for x, name in levels.items()}
+            rows = {x: rows_under([planned.name], CONDITIONS[name], records)[0] for x, name in levels.items()}
             there = {x: row.mean(RANKED_BY) for x, row in rows.items() if row.is_complete}
             if there:
                 axes.plot(list(there), list(there.values()), "o-", color=method_color(k), label=planned.name)
-        noise = {x: ceiling_row(known[name].scenes, records).mean(RANKED_BY) for x, name in levels.items()}
+        noise = {x: ceiling_row(CONDITIONS[name].scenes, records).mean(RANKED_BY) for x, name in levels.items()}
         axes.plot(list(noise), list(noise.values()), "k--", lw=0.8, label="noise of the truth")
         axes.set_xscale("log")
         axes.set_xticks(list(levels), [f"{x:g}" if x >= 1 else f"1/{1 / x:g}" for x in levels])
@@ -141,20 +142,17 @@ def hard(sweep: Path, scenes: Path, out: Path) -> None:
     """Show a crop of what is hard: truth, and what each row renders at the middle of the clip, with its PSNR there."""
     names = [row.name for row in on_conditions.GROUP.rows]
     lines = [(name.partition("-")[0], name, DEFAULT_SPLIT) for name in on_conditions.CONTENT.scenes]
-    known = {condition.name: condition for condition in on_conditions.CONDITIONS}
-    lines += [(f"car, {name}", known[name].scenes[0], known[name].split) for name in SHOWN_CONDITIONS]
+    lines += [(f"car, {name}", CONDITIONS[name].scenes[0], CONDITIONS[name].split) for name in SHOWN_CONDITIONS]
     figure = new_figure((1.9 * (len(names) + 1), 1.35 * len(lines)), "constrained")
     for axes, (title, name, split) in zip(figure.subplots(len(lines), len(names) + 1), lines, strict=True):
         scene = open_scene(scenes / name)
         target = scene.targets[len(scene.targets) // 2]
-        truth, moving = scene.ground_truth(target), scene.moving(target)
-        (box,) = crops([moving])
+        (box,) = crops([scene.moving(target)])
         assert box is not None, "something that moves"
-        shown = {title: truth}
+        shown = {title: scene.ground_truth(target)}
         for row in names:
             if folder := _predictions(sweep, row, name, split):
-                image = read_exr(folder / f"{target.name}.exr", truth.shape)
-                scores = measure(ImagePair(image, truth, moving, target.name), None, [METRICS[RANKED_BY]]).values
+                image, scores = _scored(scene, target, folder)
                 shown[f"{row}: {scores[RANKED_BY]:.1f} dB"] = image
         for axis in axes:
             axis.set_axis_off()
@@ -176,7 +174,7 @@ def sheets(sweep: Path, scenes: Path, out: Path) -> None:
         scene = open_scene(scenes / name)
         found = {row: _predictions(sweep, row, name) for row in SHOWN}
         folders = {row: folder for row, folder in found.items() if folder}
-        records = [_scored(row, scene, folder) for row, folder in folders.items()]
+        records = [_record(row, scene, folder) for row, folder in folders.items()]
         _save(make_sheet(make_panels(scene, folders, records)), out / f"{name.partition('-')[0]}.webp", SHEET_WIDTH)
 
 
@@ -184,15 +182,18 @@ def _predictions(sweep: Path, row: str, scene: str, split: str = DEFAULT_SPLIT) 
     return next(sweep.glob(f"*/quick-{split}/seed-0/predictions/{row}/{scene}"), None)
 
 
-def _scored(row: str, scene: Scene, folder: Path) -> dict[str, Any]:
+def _record(row: str, scene: Scene, folder: Path) -> dict[str, Any]:
     """Return what a sheet shows of a record: PSNR of each image."""
-    scores = {}
-    for target in scene.targets:
-        truth = scene.ground_truth(target)
-        render = read_exr(folder / f"{target.name}.exr", truth.shape)
-        pair = ImagePair(render, truth, scene.moving(target), target.name)
-        scores[target.name] = measure(pair, None, [METRICS[m] for m in ("psnr", "psnr_dynamic")]).values
+    scores = {target.name: _scored(scene, target, folder)[1] for target in scene.targets}
     return {"method": {"name": row}, "scenes": {scene.id: {"status": "ok", "per_image": scores}}}
+
+
+def _scored(scene: Scene, target: Target, folder: Path) -> tuple[Float32, dict[str, float]]:
+    """Return a rendered image [H, W] and its PSNR, whole and where things move."""
+    truth = scene.ground_truth(target)
+    image = read_exr(folder / f"{target.name}.exr", truth.shape)
+    pair = ImagePair(image, truth, scene.moving(target), target.name)
+    return image, measure(pair, None, [METRICS[m] for m in ("psnr", RANKED_BY)]).values
 
 
 def _save(figure: object, out: Path, width: int | None = None) -> None:

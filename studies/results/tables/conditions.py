@@ -111,15 +111,16 @@ _NOISE = "noise of the truth"
 def conditions_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of the table: PSNR without a condition, and what each one changes, in dB, by row.
 
-    Conditions that no row was measured under in both worlds are left out, and rows that were not measured without one.
+    Left out are conditions that no row was measured under in all their worlds, and rows that were not measured without
+    one.
     """
     own = [record for group in _EVERY for record in of_group(group, records)]
     if not own:
         return [NOTHING]
-    undisturbed = rows_under([row.name for row in GROUP.rows], CONDITIONS[0], own)
-    names = [row.name for row in undisturbed if row.is_complete]
     none, *others = CONDITIONS
-    lines = [[none.name, "", *map(both_text, rows_under(names, none, own)), _ceiling(none, records)]]
+    first = [row for row in rows_under([row.name for row in GROUP.rows], none, own) if row.is_complete]
+    names = [row.name for row in first]
+    lines = [[none.name, "", *map(both_text, first), _ceiling(none, records)]]
     for condition in others:
         rows, without = (rows_under(names, c, own) for c in (condition, replace(none, worlds=condition.worlds)))
         if any(row.is_complete for row in rows):
