@@ -7,6 +7,8 @@ the records. sheets SWEEP SCENES FOLDER, hard SWEEP SCENES OUT: of the predictio
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +28,11 @@ from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT, Target
 from spike4dgs.studies.results.blocks import NINE, of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
-from spike4dgs.studies.results.records import read_records
+from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.tables import conditions as on_conditions
+from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
 from spike4dgs.studies.results.tables.ceilings import ceiling_row
-from spike4dgs.studies.results.tables.conditions import rows_under
+from spike4dgs.studies.results.tables.conditions import Condition, rows_under
 from spike4dgs.studies.results.tables.modality import plot_modality
 from spike4dgs.studies.results.tables.published import given_row
 
@@ -50,9 +53,10 @@ TFP_TICKS = 40
 LEVELS = {  # of a panel: its axis -> the names of conditions, by amount
     "light": {1 / 64: "light 1/64", 1 / 16: "light 1/16", 1 / 4: "light 1/4", 1: "none", 2: "light times 2"},
     "speed": {1: "none", 2: "twice as fast", 4: "four times as fast"},
-    "length of the clip, ms": {5: "5 ms", 20: "none", 100: "100 ms"},
+    "length of the clip, ms": {5: "5 ms", 20: "none", 100: "100 ms", 500: "500 ms, car-1 alone"},
     "cameras": {3: "3 of 8 cameras", 5: "5 of 8 cameras", 8: "none"},
 }
+MEASURED = {"psnr": "PSNR, dB", RANKED_BY: "PSNR where things move, dB"}
 CONDITIONS = {condition.name: condition for condition in on_conditions.CONDITIONS}
 SHOWN_CONDITIONS = ("light 1/16", "four times as fast", "5 of 8 cameras")
 SHEET_WIDTH = 1500  # pixels
@@ -116,26 +120,48 @@ def modality(out: Path) -> None:
 
 
 def conditions(out: Path) -> None:
-    """Show PSNR where things move by light, speed, length of the clip and number of cameras, row by row."""
+    """Show PSNR, whole and where things move, by light, speed, length of the clip and number of cameras, row by row.
+
+    The change that a condition makes in one world alone is added to the mean of both.
+    """
     records = list(read_records(RECORDS).values())
-    figure = new_figure((13, 4), "constrained")
-    panels = figure.subplots(1, len(LEVELS), sharey=True)
-    for axes, (title, levels) in zip(panels, LEVELS.items(), strict=True):
-        for k, planned in enumerate(on_conditions.GROUP.rows):
-            rows = {x: rows_under([planned.name], CONDITIONS[name], records)[0] for x, name in levels.items()}
-            there = {x: row.mean(RANKED_BY) for x, row in rows.items() if row.is_complete}
-            if there:
-                axes.plot(list(there), list(there.values()), "o-", color=method_color(k), label=planned.name)
-        noise = {x: ceiling_row(CONDITIONS[name].scenes, records).mean(RANKED_BY) for x, name in levels.items()}
-        axes.plot(list(noise), list(noise.values()), "k--", lw=0.8, label="noise of the truth")
-        axes.set_xscale("log")
-        axes.set_xticks(list(levels), [f"{x:g}" if x >= 1 else f"1/{1 / x:g}" for x in levels])
-        axes.minorticks_off()
-        axes.set_xlabel(title)
-        axes.grid(alpha=0.3)
-    panels[0].set_ylabel("PSNR where things move, dB")
-    panels[0].legend(fontsize=8)
+    figure = new_figure((13, 8), "constrained")
+    panels = figure.subplots(len(MEASURED), len(LEVELS), sharex="col", sharey="row")
+    for line, (metric, title) in zip(panels, MEASURED.items(), strict=True):
+        for axes, (label, levels) in zip(line, LEVELS.items(), strict=True):
+            for k, planned in enumerate(on_conditions.GROUP.rows):
+                curve = _curve(planned.name, metric, levels, records)
+                axes.plot(*curve, "o-", color=method_color(k), label=planned.name)
+            axes.plot(*_curve(CEILING, metric, levels, records), "k--", lw=0.8, label="noise of the truth")
+            axes.set_xscale("log")
+            axes.set_xticks(list(levels), [f"{x:g}" if x >= 1 else f"1/{1 / x:g}" for x in levels])
+            axes.minorticks_off()
+            axes.set_xlabel(label)
+            axes.grid(alpha=0.3)
+        line[0].set_ylabel(title)
+    panels[0, 0].legend(fontsize=8)
     _save(figure, out)
+
+
+def _curve(
+    name: str, metric: str, levels: Mapping[float, str], records: Sequence[Record]
+) -> tuple[list[float], list[float]]:
+    """Return the amounts at which a row was measured, and its values there, dB."""
+
+    def mean(condition: Condition) -> float | None:
+        if name == CEILING:
+            return ceiling_row(condition.scenes, records).mean(metric)
+        (row,) = rows_under([name], condition, records)
+        return row.mean(metric) if row.is_complete else None
+
+    none, found = CONDITIONS["none"], {}
+    for amount, level in levels.items():
+        condition = CONDITIONS[level]
+        values = [mean(c) for c in (condition, replace(none, worlds=condition.worlds), none)]
+        if None not in values:
+            there, without, both = values
+            found[amount] = both + there - without
+    return list(found), list(found.values())
 
 
 def hard(sweep: Path, scenes: Path, out: Path) -> None:

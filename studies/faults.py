@@ -64,6 +64,7 @@ CASES = (
     Case("gain", "10 %", {"gain": 0.1}),
     Case("poses", "0.1°", {"pose_deg": 0.1}),
     Case("poses", "1°", {"pose_deg": 1}),
+    Case("poses", "2°", {"pose_deg": 2}),
     Case(
         "all of them",
         "small",

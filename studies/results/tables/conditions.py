@@ -74,6 +74,7 @@ CONDITIONS = (
     Condition("four times as fast", "--speed 4"),
     Condition("5 ms", ms=5),
     Condition("100 ms", ms=100),
+    Condition("500 ms, car-1 alone", ms=500, worlds=("car-1",)),
     Condition("5 of 8 cameras", split="views-5"),
     Condition("3 of 8 cameras", split="views-3"),
     Condition("the array moves, car-1 alone", "--array-motion 2 --array-rotation 60", worlds=("car-1",)),
