@@ -268,6 +268,8 @@ class SplitRenderer(MultiViewRenderer):
         points, normals, light = (np.array(a) for a in (static.points, static.normals, static.smooth))
         reach = 2 * (int(np.ceil(self.soft.anchor_px)) + 1) + 1  # what the keys between two anchors trace
         where = np.flatnonzero(maximum_filter(self.traced(t_s), size=(1, reach, reach)))
+        if not len(where):  # all that moves has left the views
+            return points, normals, light
         on_object = self.object_masks(t_s).ravel()[where]
         self._scene.set_time(t_s)
         seen, facing, coated = self._tracer.surfaces(where, True)

@@ -186,3 +186,11 @@ def test_chosen_numbers_of_samples_leave_the_mean(r, whole, monkeypatch):
         difference = chosen.mean(0)[some] - whole.mean(0)[some]
         error = np.sqrt(np.mean(chosen.var(0)[some] / 23 + whole.var(0)[some] / 7) / some.sum())
         assert abs(difference.mean()) < 4 * error + 1e-4
+
+
+def test_what_has_left_all_views_leaves_the_background():
+    if load_mitsuba().variant().startswith("scalar"):
+        pytest.skip("split light needs a variant that compiles kernels")
+    car = renderer(built("car", 1))
+    assert not car.traced(1000.0).any()
+    np.testing.assert_array_equal(car.keys(1000.0), car.background)
