@@ -30,6 +30,7 @@ from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.tables import conditions as on_conditions
+from spike4dgs.studies.results.tables.breaks import LEVELS, NAMED, NONE, amount_text
 from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
 from spike4dgs.studies.results.tables.ceilings import ceiling_row
 from spike4dgs.studies.results.tables.conditions import Condition, rows_under
@@ -50,14 +51,7 @@ SHOWN = (  # rows of a sheet: ours, the best tuned rival, and each kind of the p
 )
 COLUMNS = 8  # of the strip: truth and seven image makers
 TFP_TICKS = 40
-LEVELS = {  # of a panel: its axis -> the names of conditions, by amount
-    "light": {1 / 64: "light 1/64", 1 / 16: "light 1/16", 1 / 4: "light 1/4", 1: "none", 2: "light times 2"},
-    "speed": {1: "none", 2: "twice as fast", 4: "four times as fast"},
-    "length of the clip, ms": {5: "5 ms", 20: "none", 100: "100 ms", 500: "500 ms, car-1 alone"},
-    "cameras": {3: "3 of 8 cameras", 5: "5 of 8 cameras", 8: "none"},
-}
 MEASURED = {"psnr": "PSNR, dB", RANKED_BY: "PSNR where things move, dB"}
-CONDITIONS = {condition.name: condition for condition in on_conditions.CONDITIONS}
 SHOWN_CONDITIONS = ("light 1/16", "four times as fast", "5 of 8 cameras")
 SHEET_WIDTH = 1500  # pixels
 
@@ -134,7 +128,7 @@ def conditions(out: Path) -> None:
                 axes.plot(*curve, "o-", color=method_color(k), label=planned.name)
             axes.plot(*_curve(CEILING, metric, levels, records), "k--", lw=0.8, label="noise of the truth")
             axes.set_xscale("log")
-            axes.set_xticks(list(levels), [f"{x:g}" if x >= 1 else f"1/{1 / x:g}" for x in levels])
+            axes.set_xticks(list(levels), [amount_text(x) for x in levels])
             axes.minorticks_off()
             axes.set_xlabel(label)
             axes.grid(alpha=0.3)
@@ -154,10 +148,10 @@ def _curve(
         (row,) = rows_under([name], condition, records)
         return row.mean(metric) if row.is_complete else None
 
-    none, found = CONDITIONS["none"], {}
+    found = {}
     for amount, level in levels.items():
-        condition = CONDITIONS[level]
-        values = [mean(c) for c in (condition, replace(none, worlds=condition.worlds), none)]
+        condition = NAMED[level]
+        values = [mean(c) for c in (condition, replace(NONE, worlds=condition.worlds), NONE)]
         if None not in values:
             there, without, both = values
             found[amount] = both + there - without
@@ -168,7 +162,7 @@ def hard(sweep: Path, scenes: Path, out: Path) -> None:
     """Show a crop of what is hard: truth, and what each row renders at the middle of the clip, with its PSNR there."""
     names = [row.name for row in on_conditions.GROUP.rows]
     lines = [(name.partition("-")[0], name, DEFAULT_SPLIT) for name in on_conditions.CONTENT.scenes]
-    lines += [(f"car, {name}", CONDITIONS[name].scenes[0], CONDITIONS[name].split) for name in SHOWN_CONDITIONS]
+    lines += [(f"car, {name}", NAMED[name].scenes[0], NAMED[name].split) for name in SHOWN_CONDITIONS]
     figure = new_figure((1.9 * (len(names) + 1), 1.35 * len(lines)), "constrained")
     for axes, (title, name, split) in zip(figure.subplots(len(lines), len(names) + 1), lines, strict=True):
         scene = open_scene(scenes / name)

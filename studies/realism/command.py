@@ -27,7 +27,7 @@ from spike4dgs.studies.kit.blocks import pattern
 from spike4dgs.studies.kit.timing import markdown, write_csv
 from spike4dgs.studies.realism import windows as w
 from spike4dgs.studies.realism.classifier import FOLDS, auc_interval, out_of_fold, single_aucs, tiles
-from spike4dgs.studies.realism.ranks import agreement, prediction_errors
+from spike4dgs.studies.realism.ranks import agreement, makers_here, prediction_errors
 
 TILE = 40  # px: windows of one square are trained on or tested together
 SHOWN = 8  # features in the table and the plot
@@ -151,10 +151,10 @@ def realism(
 
 
 def _ranks(spikes: UInt8, regions: dict[str, Mask], sensors: dict[str, Sensor], seed: int) -> dict[str, Any]:
-    light = w.course(spikes)
+    light, makers = w.course(spikes), makers_here()
     recordings = {"real": spikes, **{name: w.record(*light, sensor, seed) for name, sensor in sensors.items()}}
     errors = {
-        region: {name: prediction_errors(recorded, pixels) for name, recorded in recordings.items()}
+        region: {name: prediction_errors(recorded, pixels, makers) for name, recorded in recordings.items()}
         for region, pixels in regions.items()
     }
     tau = {

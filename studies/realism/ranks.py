@@ -7,34 +7,34 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.stats import kendalltau
 
-from spike4dgs.baselines.images.tfi import TFI
+from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfp import TFP, TfpSettings
-from spike4dgs.baselines.images.tfstp import TFSTP
 from spike4dgs.benchmark.arrays import Mask, UInt8
-from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.base import ImageMaker
-from spike4dgs.method.images.intervals import INTERVALS
 from spike4dgs.studies.realism.windows import stream_of
 
 SEEN, NEXT = 100, 10  # ticks that an image is made of, and whose counts it predicts
 MAKERS: Mapping[str, ImageMaker] = {
     **{f"tfp, {2 * half} ticks": TFP.with_settings(TfpSettings(half_window=half)) for half in (5, 10, 20, 40)},
-    "tfi": TFI,
-    "tfstp": TFSTP,
-    "adaptive": ADAPTIVE,
-    "intervals": INTERVALS,
+    **{name: IMAGES[name] for name in ("tfi", "tfstp", "adaptive", "intervals")},
 }
+NETWORKS = ("spk2img", "msdi", "ssml", "ssir", "scflow-tfp")  # SpikeCLIP looks at more ticks than there are
 
 
-def prediction_errors(spikes: UInt8, pixels: Mask) -> dict[str, float]:
+def makers_here() -> dict[str, ImageMaker]:
+    """Return the image makers, those of networks where their weights are installed."""
+    return {**MAKERS, **{name: IMAGES[name] for name in NETWORKS if IMAGES[name].learned() is not None}}
+
+
+def prediction_errors(spikes: UInt8, pixels: Mask, makers: Mapping[str, ImageMaker] = MAKERS) -> dict[str, float]:
     """Return each maker's mean squared error, spikes per tick, of the next NEXT ticks' rate over `pixels` [H, W].
 
     An image is made of the SEEN ticks before alone, and asked for at their end.
     """
-    errors: dict[str, list[float]] = {name: [] for name in MAKERS}
+    errors: dict[str, list[float]] = {name: [] for name in makers}
     for tick in range(SEEN, len(spikes) - NEXT + 1, 2 * NEXT):
         seen, truth = stream_of(spikes[tick - SEEN : tick]), spikes[tick : tick + NEXT].mean(0)
-        for name, maker in MAKERS.items():
+        for name, maker in makers.items():
             image = maker(seen, [SEEN - 1], 1.0)[0]
             errors[name].append(float(np.mean((image - truth)[pixels] ** 2)))
     return {name: float(np.mean(values)) for name, values in errors.items()}

@@ -21,7 +21,7 @@ NO_LEAD = "No row of ours and another with equal knowledge have been measured on
 NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes), ALL_ROWS)
 SMALL_NETWORK = "`spk2img` is a small network that we trained: width 8, published 64, and 2,500 steps."
 _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
-_BOTH = ("psnr", RANKED_BY)
+BOTH = ("psnr", RANKED_BY)
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
 _LEGEND = (
     "Ranks are by PSNR where things move; rows that the intervals do not tell apart share them. After ± is half of a "
@@ -82,9 +82,8 @@ def lead_block(group: Group, records: Sequence[Record]) -> list[str]:
 def headline_block(group: Group, records: Sequence[Record]) -> list[str]:
     """Return a sentence for each knowledge: the lead of the best row of ours."""
     own = of_group(group, records)
-    commits = ", ".join(sorted({_commit(r) for r in own}))
     lines = [
-        f"- {knowledge}, `{rows[0].name}`: {_lead_text(rows[0], rivals)} (commit {commits})."
+        f"- {knowledge}, `{rows[0].name}`: {_lead_text(rows[0], rivals)} ({commits_text(own).lower()})."
         for knowledge, rows, rivals in _leaders(group, own)
     ]
     return lines or [NO_LEAD if own else NOTHING]
@@ -103,8 +102,7 @@ def home_block(records: Sequence[Record]) -> list[str]:
         )
         lines += [[f"`{rows[0].name}`", knowledge, *_scores(rows[0])] for rows in kinds if rows]
     heads = ("row", "given", "PSNR, dB", "PSNR where things move, dB", "SSIM", "FLIP (less is better)")
-    commits = ", ".join(sorted({_commit(r) for r in own}))
-    return [*markdown(heads, lines), "", f"Commit {commits}; {_processors(own)}."] if lines else [NOTHING]
+    return [*markdown(heads, lines), "", f"{commits_text(own)}; {_processors(own)}."] if lines else [NOTHING]
 
 
 def of_group(group: Group, records: Iterable[Record]) -> list[Record]:
@@ -182,7 +180,7 @@ def _time(row: MeasuredRow, name: str) -> str:
     return text if row.is_quiet or text == "-" else f"({text})"
 
 
-def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = _BOTH) -> str:
+def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = BOTH) -> str:
     """Return metrics of a scene, means over seeds; "-" where there are none."""
     cells = [r["metrics"] for (s, _), r in row.cells.items() if s == scene]
     means = []
@@ -194,14 +192,14 @@ def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = _BOTH) -> 
 
 def both_text(row: MeasuredRow) -> str:
     """Return PSNR of the whole image and where things move, means over scenes and seeds; "-" of an incomplete row."""
-    return " / ".join(metric_text(row.mean(metric), 2) for metric in _BOTH) if row.is_complete else "-"
+    return " / ".join(metric_text(row.mean(metric), 2) for metric in BOTH) if row.is_complete else "-"
 
 
 def change_text(row: MeasuredRow, other: MeasuredRow) -> str:
     """Return by how much a row is ahead of another, as `both_text`; "-" where either is incomplete."""
     if not (row.is_complete and other.is_complete):
         return "-"
-    return " / ".join(f"{fmean(differences(row, other, metric)):+.2f}" for metric in _BOTH)
+    return " / ".join(f"{fmean(differences(row, other, metric)):+.2f}" for metric in BOTH)
 
 
 def _lead_text(row: MeasuredRow, rivals: Sequence[MeasuredRow]) -> str:
@@ -234,22 +232,36 @@ def provenance(own: Sequence[Record], *groups: Group) -> str:
     seeds = sorted({r["seed"] for r in measured})
     scenes = {r["scene"]: r["revision"] for r in own}
     planned = len(cells_of(groups))
-    commits = sorted({_commit(r) for r in own})
     budgets = list(dict.fromkeys(group.budget for group in groups))
     facts = [
-        f"Commit{'s' * (len(commits) > 1)} {', '.join(commits)}",
+        commits_text(own),
         f"revisions of {len(scenes)} scenes {sha256_json(scenes)[:DIGITS]}",
         _processors(own),
         f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds)) or '-'}",
         f"budget{'s' * (len(budgets) > 1)} {', '.join(budgets)}",
-        f"{len(measured)} of {planned} planned cells",
+        f"{len(measured)} of {planned} planned cells{_finite(own)}",
     ]
     small = [SMALL_NETWORK] if any(r["row"].startswith("spk2img") for r in own) else []
     return " ".join([f"{'; '.join(facts)}.", *_mixed_code(own), _tuning(own), *small])
 
 
+def _finite(own: Sequence[Record]) -> str:
+    """Return whether all measured values are finite, and how many cells have a reason and no values."""
+    measured = [r for r in own if r["error"] is None]
+    odd = sum(not all(map(math.isfinite, r["metrics"].values())) for r in measured)
+    failed = len(own) - len(measured)
+    finite = f", {odd} not finite" if odd else ", all finite"
+    return finite + f", and {failed} that failed" * bool(failed)
+
+
 def _processors(own: Iterable[Record]) -> str:
     return " and ".join(sorted({r["cpu"] for r in own}))
+
+
+def commits_text(own: Iterable[Record]) -> str:
+    """Return the commits of records in words."""
+    commits = sorted({_commit(r) for r in own})
+    return f"Commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
 
 
 def _commit(record: Record) -> str:

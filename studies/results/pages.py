@@ -12,6 +12,7 @@ from spike4dgs.studies.kit.blocks import pattern
 from spike4dgs.studies.results.blocks import NINE, headline_block, home_block, lead_block, scenes_block, table_block
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, TABLE3, TABLE4, TABLE7
 from spike4dgs.studies.results.records import Record
+from spike4dgs.studies.results.tables.breaks import breaks_block
 from spike4dgs.studies.results.tables.conditions import conditions_block, content_block
 from spike4dgs.studies.results.tables.images import images_block
 from spike4dgs.studies.results.tables.modality import modality_block
@@ -21,6 +22,7 @@ from spike4dgs.studies.results.tables.steps import steps_block
 
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
     "conditions": conditions_block,
+    "breaks": breaks_block,
     "content": content_block,
     "headline": lambda records: headline_block(NINE, records),
     "home": home_block,

@@ -15,7 +15,7 @@ from spike4dgs.generators.sensor.model import Sensor
 from spike4dgs.studies.realism import windows as w
 from spike4dgs.studies.realism.classifier import FOLDS, auc, auc_interval, out_of_fold, single_aucs
 from spike4dgs.studies.realism.command import TILE, compare, fit_sensor, realism, sensor_with, split
-from spike4dgs.studies.realism.ranks import MAKERS, agreement, prediction_errors
+from spike4dgs.studies.realism.ranks import MAKERS, agreement, makers_here, prediction_errors
 
 PLAIN = Sensor(radiance_gain=1.0, photons=5e4)
 SQUARE = 32  # px of a tile of the recording that is made here: a third fewer windows than with TILE
@@ -187,3 +187,11 @@ def test_a_real_camera_is_told_less_from_the_mended_sensor():
         for name, sensor in {"before": sensor_with(0.0, 0.0), "after": sensor_with(0.008, 0.0065)}.items()
     }
     assert areas["before"] > 0.8 and areas["after"] < 0.7
+
+
+def test_networks_predict_where_their_weights_are():
+    _, spikes = still()
+    shipped = {name: makers_here()[name] for name in ("spk2img", "msdi")}
+    errors = prediction_errors(spikes, np.ones(spikes.shape[1:], bool), {**MAKERS, **shipped})
+    assert errors["tfp, 80 ticks"] < errors["spk2img"] < errors["tfp, 10 ticks"], "as a window of some ticks"
+    assert errors["tfp, 80 ticks"] < errors["msdi"] < errors["tfp, 10 ticks"]

@@ -23,6 +23,7 @@ from spike4dgs.studies.results.blocks import (
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
 from spike4dgs.studies.results.pages import BLOCKS
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row
+from spike4dgs.studies.results.tables.breaks import breaks_block
 from spike4dgs.studies.results.tables.conditions import (
     CONDITIONS,
     CONTENT,
@@ -116,7 +117,7 @@ Ranks are by PSNR where things move; rows that the intervals do not tell apart s
 were measured beside other programs.
 
 Commit c0ffee000000; revisions of 4 scenes a175f1a1ca17; A processor, 2 cores; seeds 0, 1; budget quick; 21 of 24 \
-planned cells. Tuned on: here (`spike4dgs-x`); elsewhere (the others).
+planned cells, all finite, and 1 that failed. Tuned on: here (`spike4dgs-x`); elsewhere (the others).
 """
 
 
@@ -216,6 +217,7 @@ def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
     assert BLOCKS[name]([]) == [NOTHING]
     of = {
+        "breaks": ON_CONDITIONS,
         "conditions": ON_CONDITIONS,
         "content": CONTENT,
         "modality": ON_SENSORS,
@@ -293,6 +295,32 @@ def test_a_condition_that_was_made_in_one_world_is_compared_with_that_world():
     found = [record(OURS, s, psnr) for s, psnr in zip(CONDITIONS[0].scenes, (30.0, 50.0), strict=True)]
     found += [record(OURS, moves.scenes[0], 28.0)]
     assert conditions_block(found)[3].endswith(f"| `{moves.options}` | -2.00 / -2.00 | - |")
+
+
+def test_what_breaks_a_row_is_the_mildest_amount_that_costs_three_decibels():
+    """Of light: 1/4 costs 2.9 dB, 1/16 costs 3.1; more light none. One world counts against itself alone."""
+    losses = {"none": 0.0, "light 1/4": 2.9, "light 1/16": 3.1, "light times 2": 0.0}
+    found = [record(OURS, s, 40.0 - losses[c.name]) for c in CONDITIONS if c.name in losses for s in c.scenes]
+    alone = next(c for c in CONDITIONS if c.ms == 500)
+    found += [record(OURS, s, 36.5) for s in alone.scenes]
+    lines = breaks_block(found)
+    cells = {(line.split(" | ")[0], line.split(" | ")[1]): line.split(" | ")[2] for line in lines[2:8]}
+    assert cells["| light", "1/4, 1/16, 1/64"] == "1/16 / 1/16"
+    assert cells["| light", "2"] == "no / no"
+    assert cells["| length of the clip, ms", "100, 500"] == "500 / 500"
+    assert cells["| speed", "2, 4"] == "-"
+    assert "Of the other conditions, none costs a row as much." in lines[-1]
+    lens = next(c for c in CONDITIONS if c.name.startswith("lens"))
+    lines = breaks_block([*found, *(record(OURS, s, 30.0) for s in lens.scenes)])
+    assert f"Of the other conditions, lens, known (`{OURS}`) costs a row as much." in lines[-1]
+
+
+def test_pages_say_whether_all_values_are_finite_and_how_many_cells_failed():
+    found = [record(OURS, s, 30.0) for s in CONDITIONS[0].scenes]
+    assert "planned cells, all finite. " in conditions_block(found)[-1]
+    found[0]["metrics"]["psnr"] = float("nan")
+    failed = record("tfp+stg", CONDITIONS[0].scenes[0], 30.0) | {"error": "no points", "metrics": {}}
+    assert " cells, 1 not finite, and 1 that failed." in conditions_block([*found, failed])[-1]
 
 
 def test_fewer_cameras_are_a_condition_of_the_undisturbed_scenes():

@@ -1,0 +1,91 @@
+"""What breaks whom, at which size: the mildest amount of each cause that costs a row much."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from statistics import fmean
+
+from spike4dgs.studies.kit.timing import markdown
+from spike4dgs.studies.results.blocks import BOTH, NOTHING, commits_text, of_group
+from spike4dgs.studies.results.comparison import differences
+from spike4dgs.studies.results.records import Record
+from spike4dgs.studies.results.tables.conditions import CONDITIONS, GROUP, Condition, of_conditions, rows_under
+
+BROKEN_DB = 3  # twice the error
+NAMED = {condition.name: condition for condition in CONDITIONS}
+NONE = CONDITIONS[0]
+LEVELS = {  # a cause -> the names of its conditions, by amount
+    "light": {1 / 64: "light 1/64", 1 / 16: "light 1/16", 1 / 4: "light 1/4", 1: NONE.name, 2: "light times 2"},
+    "speed": {1: NONE.name, 2: "twice as fast", 4: "four times as fast"},
+    "length of the clip, ms": {5: "5 ms", 20: NONE.name, 100: "100 ms", 500: "500 ms, car-1 alone"},
+    "cameras": {3: "3 of 8 cameras", 5: "5 of 8 cameras", 8: NONE.name},
+}
+
+
+def amount_text(amount: float) -> str:
+    """Return an amount as pages have it.
+
+    >>> amount_text(1 / 16), amount_text(2)
+    ('1/16', '2')
+    """
+    return f"{amount:g}" if amount >= 1 else f"1/{1 / amount:g}"
+
+
+def breaks_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of a table: for each cause and row the mildest amount that costs `BROKEN_DB` or more."""
+    own = of_conditions(records)
+    if not of_group(GROUP, own):
+        return [NOTHING]
+    names = [row.name for row in GROUP.rows]
+    lines = [
+        [cause, ", ".join(map(amount_text, side)), *(_broken(name, side, own) for name in names)]
+        for cause, side in _sides()
+    ]
+    legend = (
+        f"The mildest amount that costs {BROKEN_DB} dB or more, in the whole image / where things move; "
+        f'"no" where no measured amount does, "-" where nothing was measured. {_others(own, names)} '
+        f"{commits_text(own)}."
+    )
+    return [*markdown(("cause", "amounts", *(f"`{name}`" for name in names)), lines), "", legend]
+
+
+def _sides() -> Iterator[tuple[str, dict[float, str]]]:
+    """Yield each cause with its amounts on one side of what there is without a condition, the mildest first."""
+    for cause, levels in LEVELS.items():
+        (usual,) = (amount for amount, name in levels.items() if name == NONE.name)
+        for side in (sorted((a for a in levels if a < usual), reverse=True), sorted(a for a in levels if a > usual)):
+            if side:
+                yield cause, {amount: levels[amount] for amount in side}
+
+
+def _broken(name: str, side: Mapping[float, str], own: Sequence[Record]) -> str:
+    changes = {amount: change for amount, level in side.items() if (change := _changes(name, NAMED[level], own))}
+    if not changes:
+        return "-"
+    found = []
+    for k in range(len(BOTH)):
+        broken = [amount for amount, change in changes.items() if change[k] <= -BROKEN_DB]
+        found.append(amount_text(broken[0]) if broken else "no")
+    return " / ".join(found)
+
+
+def _changes(name: str, condition: Condition, own: Sequence[Record]) -> list[float] | None:
+    """Return what a condition changes for a row, dB, by `BOTH`; None where it was not measured."""
+    pair = (rows_under([name], c, own)[0] for c in (condition, replace(NONE, worlds=condition.worlds)))
+    row, without = pair
+    if not (row.is_complete and without.is_complete):
+        return None
+    return [fmean(differences(row, without, metric)) for metric in BOTH]
+
+
+def _others(own: Sequence[Record], names: Sequence[str]) -> str:
+    """Return a sentence on the conditions of one size alone."""
+    sized = {name for levels in LEVELS.values() for name in levels.values()}
+    broken = []
+    for condition in CONDITIONS:
+        if condition.name not in sized:
+            found = {name: _changes(name, condition, own) for name in names}
+            rows = [f"`{name}`" for name, change in found.items() if change and min(change) <= -BROKEN_DB]
+            broken += [f"{condition.name} ({', '.join(rows)})"] if rows else []
+    return f"Of the other conditions, {'; '.join(broken) or 'none'} costs a row as much."
