@@ -18,7 +18,7 @@ NONE = CONDITIONS[0]
 LEVELS = {  # a cause -> the names of its conditions, by amount
     "light": {1 / 64: "light 1/64", 1 / 16: "light 1/16", 1 / 4: "light 1/4", 1: NONE.name, 2: "light times 2"},
     "speed": {1: NONE.name, 2: "twice as fast", 4: "four times as fast"},
-    "length of the clip, ms": {5: "5 ms", 20: NONE.name, 100: "100 ms", 500: "500 ms, car-1 alone"},
+    "length of the clip, ms": {5: "5 ms", 20: NONE.name, 100: "100 ms, turntable-2 alone", 500: "500 ms, car-1 alone"},
     "cameras": {3: "3 of 8 cameras", 5: "5 of 8 cameras", 8: NONE.name},
 }
 

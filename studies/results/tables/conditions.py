@@ -73,7 +73,7 @@ CONDITIONS = (
     Condition("twice as fast", "--speed 2"),
     Condition("four times as fast", "--speed 4"),
     Condition("5 ms", ms=5),
-    Condition("100 ms", ms=100),
+    Condition("100 ms, turntable-2 alone", ms=100, worlds=("turntable-2",)),
     Condition("500 ms, car-1 alone", ms=500, worlds=("car-1",)),
     Condition("5 of 8 cameras", split="views-5"),
     Condition("3 of 8 cameras", split="views-3"),
