@@ -15,7 +15,7 @@ from spike4dgs.studies.results.tables.conditions import CONDITIONS, GROUP, Condi
 BROKEN_DB = 3  # twice the error
 NAMED = {condition.name: condition for condition in CONDITIONS}
 NONE = CONDITIONS[0]
-LEVELS = {  # a cause -> the names of its conditions, by amount
+LEVELS: dict[str, dict[float, str]] = {  # a cause -> the names of its conditions, by amount
     "light": {1 / 64: "light 1/64", 1 / 16: "light 1/16", 1 / 4: "light 1/4", 1: NONE.name, 2: "light times 2"},
     "speed": {1: NONE.name, 2: "twice as fast", 4: "four times as fast"},
     "length of the clip, ms": {5: "5 ms", 20: NONE.name, 100: "100 ms, turntable-2 alone", 500: "500 ms, car-1 alone"},
