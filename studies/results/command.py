@@ -30,6 +30,7 @@ _GROUPS = (
     conditions.CONTENT,
     conditions.CEILINGS,
     modality.GROUP,
+    modality.NOISY,
     parts.GROUP,
     *steps.GROUPS,
 )
@@ -42,8 +43,8 @@ class Choice:
     Args:
         only: Groups of the plan: table1 to table4, table6, table7, unposed (table 1, poses estimated), views-3 to
             views-8 (table 5), conditions, conditions-refined, conditions-views-3 and -5, content, ceilings (of
-            conditions and content), modality, parts, steps-quick, steps-standard, steps-16, or trial (two tiny scenes).
-            All but trial if left out.
+            conditions and content), modality, modality-noisy, parts, steps-quick, steps-standard, steps-16, or trial
+            (two tiny scenes). All but trial if left out.
         rows: Rows by name; all of the groups if left out.
         scenes_of: Folder of the scenes. Those of the plan that are not there are left out.
         out: Folder for predictions and checkpoints.

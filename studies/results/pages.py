@@ -15,7 +15,7 @@ from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.breaks import breaks_block
 from spike4dgs.studies.results.tables.conditions import conditions_block, content_block
 from spike4dgs.studies.results.tables.images import images_block
-from spike4dgs.studies.results.tables.modality import modality_block
+from spike4dgs.studies.results.tables.modality import modality_block, noisy_block
 from spike4dgs.studies.results.tables.parts import own_scenes_block, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 from spike4dgs.studies.results.tables.steps import steps_block
@@ -28,6 +28,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "home": home_block,
     "lead": lambda records: lead_block(NINE, records),
     "modality": modality_block,
+    "modality-noisy": noisy_block,
     "nine-scenes": lambda records: table_block(NINE, records),
     "own-scenes": own_scenes_block,
     "pairs": pairs_block,

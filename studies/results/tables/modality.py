@@ -8,7 +8,7 @@ from pathlib import Path
 from spike4dgs.benchmark.method import get_method
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.modality.command import COLUMNS, MEAN, ROWS, Row, plot, value_text
-from spike4dgs.studies.results.blocks import NOTHING, behind_texts, of_group, provenance
+from spike4dgs.studies.results.blocks import NOTHING, behind_texts, both_text, change_text, of_group, provenance
 from spike4dgs.studies.results.comparison import MeasuredRow, Ranking, rank, rows_of
 from spike4dgs.studies.results.plan import PLAN, Group, once
 from spike4dgs.studies.results.records import Record
@@ -20,6 +20,8 @@ GROUP = Group(
     tuple(f"{scene.partition('-')[0]}-10-small-50ms" for group in PLAN for scene in group.scenes),
     once(ROWS),
 )
+NOISE = "-others"  # of an id: frames and events have noise, see `make-dataset --noisy-others`
+NOISY = Group("modality-noisy", "Frames and events with noise", (f"car-10-small-50ms{NOISE}",), once(ROWS[:5]))
 _SHOWN = ("bits_per_second", "psnr_dynamic", "psnr", "temporal_error")
 
 
@@ -37,6 +39,19 @@ def modality_block(records: Sequence[Record]) -> list[str]:
     bits, moving, *others = (COLUMNS[column] for column in _SHOWN)
     heads = ("rank", "row", "sensors", bits, moving, "behind the first, dB", *others)
     return [*markdown(heads, lines), "", f"Means of {len(GROUP.scenes)} scenes.", "", provenance(own, GROUP)]
+
+
+def noisy_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of a table: PSNR of the rows of frames and events without their noise, and what it changes."""
+    own = of_group(NOISY, records)
+    names = [row.name for row in NOISY.rows]
+    noisy = [row for row in rows_of(names, NOISY.scenes, own) if row.is_complete]
+    if not noisy:
+        return [NOTHING]
+    before = rows_of([row.name for row in noisy], [scene.removesuffix(NOISE) for scene in NOISY.scenes], records)
+    lines = [[f"`{a.name}`", both_text(b), change_text(a, b)] for a, b in zip(noisy, before, strict=True)]
+    legend = "PSNR of the whole image / where things move, dB, on car."
+    return [*markdown(("row", "without noise", "with it"), lines), "", legend, "", provenance(own, NOISY)]
 
 
 def plot_modality(path: Path, records: Sequence[Record]) -> None:

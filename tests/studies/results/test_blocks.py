@@ -35,7 +35,7 @@ from spike4dgs.studies.results.tables.conditions import (
 from spike4dgs.studies.results.tables.conditions import GROUP as ON_CONDITIONS
 from spike4dgs.studies.results.tables.images import TABLE6, images_block
 from spike4dgs.studies.results.tables.modality import GROUP as ON_SENSORS
-from spike4dgs.studies.results.tables.modality import modality_block, plot_modality
+from spike4dgs.studies.results.tables.modality import NOISY, modality_block, noisy_block, plot_modality
 from spike4dgs.studies.results.tables.parts import GROUP as PARTS
 from spike4dgs.studies.results.tables.parts import SWITCHES, own_scenes_block, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
@@ -49,6 +49,7 @@ SHOWN = {  # a block -> two rows that it has, if not those of the tables
     "table6": ("tfp.images", "msdi.images"),
     "table7": ("spike4dgs", "msdi+4dgs"),
     "unposed": ("spike4dgs-uncalibrated", "tfp+colmap+stg"),
+    "modality-noisy": ("edi+stg", "rgb+stg"),
     "pairs": ("tfp+stg", "tfp+4dgs"),
     "own-scenes": ("spike4dgs-x",),
     "parts": ("spike4dgs-x",),
@@ -220,6 +221,7 @@ def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name
         "conditions": ON_CONDITIONS,
         "content": CONTENT,
         "modality": ON_SENSORS,
+        "modality-noisy": NOISY,
         "parts": PARTS,
         "steps": PARTS,
         "table2": TABLE2,
@@ -320,6 +322,15 @@ def test_pages_say_whether_all_values_are_finite_and_how_many_cells_failed():
     found[0]["metrics"]["psnr"] = float("nan")
     failed = record("tfp+stg", CONDITIONS[0].scenes[0], 30.0) | {"error": "no points", "metrics": {}}
     assert " cells, 1 not finite, and 1 that failed." in conditions_block([*found, failed])[-1]
+
+
+def test_noise_of_frames_and_events_is_compared_with_the_same_scene_without():
+    (scene,) = NOISY.scenes
+    found = [record("edi+stg", scene, 28.0), record("edi+stg", scene.removesuffix("-others"), 30.0)]
+    assert noisy_block([*found, record("edi+4dgs", scene, 26.0)])[2:4] == [
+        "| `edi+stg` | 30.00 / 28.00 | -2.00 / -2.00 |",
+        "| `edi+4dgs` | - | - |",
+    ]
 
 
 def test_fewer_cameras_are_a_condition_of_the_undisturbed_scenes():
