@@ -328,7 +328,7 @@ def test_noise_of_frames_and_events_is_compared_with_the_same_scene_without():
     (scene,) = NOISY.scenes
     found = [record("edi+stg", scene, 28.0), record("edi+stg", scene.removesuffix("-others"), 30.0)]
     assert noisy_block([*found, record("edi+4dgs", scene, 26.0)])[2:4] == [
-        "| `edi+stg` | 30.00 / 28.00 | -2.00 / -2.00 |",
+        "| `edi+stg` | 32.00 / 30.00 | -2.00 / -2.00 |",
         "| `edi+4dgs` | - | - |",
     ]
 
