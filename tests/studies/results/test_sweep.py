@@ -197,7 +197,7 @@ def test_a_scene_of_another_processor_joins_the_records_where_it_differs_by_roun
     [
         (
             Choice(only=("table9",)),
-            "--only: expected groups among table1, table2, .*, modality, .*, parts, steps-quick, .*, trial, found table9",
+            "--only: expected groups among table1, table2, .*, modality, .*, steps-quick, .*, trial, found table9",
         ),
         (Choice(only=("trial",), rows=("tfi+stg", "tfp+stg")), "--rows: expected rows among nearest-view, .*tfi.stg;"),
         (
