@@ -14,6 +14,7 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
+from changes import leave_part
 from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, run, wait_for
 from nosy_methods import Refines
 from rich.console import Console
@@ -138,7 +139,9 @@ def test_a_failed_cell_says_why_and_is_tried_again(folder: Path) -> None:
     assert outcome.left == 0 and "bad on pattern-0, seed 0: failed: ValueError: no luck" in outcome.failed[0]
     failed = next(r for r in records.values() if r["row"] == "bad")
     assert failed["metrics"] == {} and "no luck" in failed["error"]
+    halves = [leave_part(folder / name) for name in ("records", "out")]
     outcome, records, said = swept(folder, planned, {**methods, "bad": CountMethod("bad")})
+    assert not any(half.exists() for half in halves)
     assert "2 to measure" in said and not outcome.failed
     assert {r["row"]: (r["error"] or "ok")[:7] for r in records.values()} == {"bad": "ok", "weightless": "skipped"}
 
