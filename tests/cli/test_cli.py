@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import json
 import os
 import subprocess
@@ -217,13 +218,32 @@ def test_a_number_of_threads_that_openmp_would_pass_over(
         assert capsys.readouterr().err == f"{expected}\n"
 
 
-@pytest.mark.parametrize("command", ["fit", "run-benchmark"])
-@pytest.mark.parametrize("seed", ["-1", str(2**63)])
+SEEDED = (
+    *("board-clip", "fault-table", "fit", "import-frames", "make-dataset", "make-msdi-data", "patterns", "poses"),
+    *("record", "run-benchmark", "season make", "season predict", "train-msdi", "train-spk2img", "worlds"),
+    *("report dark-poses", "report hard-cases", "report modality", "report oracle-ladder", "report realism"),
+    *("report speed-error", "report tuning"),
+)
+
+
+@pytest.mark.parametrize("name", SEEDED)
 def test_a_bad_seed_is_refused_before_any_work(
-    command: str, seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([command, str(tmp_path / "none"), "--seed", seed]) == 2
-    assert capsys.readouterr().err.startswith("error: --seed: expected a ")
+    function = cli.load(name)
+    monkeypatch.setattr(cli, "_load", lambda _: functools.wraps(function)(lambda *_, **__: pytest.fail("work began")))
+    option = "--fit-seed" if name == "season make" else "--seed"
+    bits = 128 if name == "make-dataset" else 63
+    for seed in (-1, 2**bits):
+        assert main([*COMMANDS[name].example.split(), option, str(seed)]) == 2
+        expected = f"error: {option}: expected a seed from 0 up, of {bits} bits, found {seed}; choose another seed\n"
+        assert capsys.readouterr().err == expected
+
+
+def test_a_seed_of_a_season_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    """The command lines that `season check` prints after the reveal have seeds of 128 bits."""
+    assert main(["make-dataset", "moon", "--seed", str(2**128 - 1)]) == 2
+    assert capsys.readouterr().err.startswith("error: world: expected one of ")
 
 
 def test_a_full_disk_for_the_output_is_one_line() -> None:
