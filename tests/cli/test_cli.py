@@ -18,8 +18,9 @@ from spike4dgs.cli.commands import GROUPS
 HEAVY = ("torch", "numba", "mitsuba", "skimage", "cv2", "scipy", "matplotlib", "numpy", "tyro", "rich")
 
 
-def python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
+def python(*arguments: str, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
+    given = {**os.environ, **environment}
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=cwd, env=given)
 
 
 def test_help_takes_no_time_of_the_processor_and_imports_nothing_heavy() -> None:
@@ -218,6 +219,12 @@ def test_a_number_of_threads_that_openmp_would_pass_over(
         assert capsys.readouterr().err == f"{expected}\n"
 
 
+def test_a_bad_number_of_threads_is_said_before_openmp_reads_it() -> None:
+    done = python("-m", "spike4dgs.cli", "doctor", OMP_NUM_THREADS="x")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: OMP_NUM_THREADS: ") and done.stderr.count("\n") == 1, "no line of libgomp"
+
+
 SEEDED = (
     *("board-clip", "fault-table", "fit", "import-frames", "make-dataset", "make-msdi-data", "patterns", "poses"),
     *("record", "run-benchmark", "season make", "season predict", "train-msdi", "train-spk2img", "worlds"),
@@ -258,3 +265,11 @@ def test_a_folder_whose_name_is_no_text_is_one_line(tmp_path: Path, capsys: pyte
     name = os.fsdecode(os.fsencode(tmp_path) + b"/sc\xff")
     assert main(["inspect", name]) == 2
     assert capsys.readouterr().err.endswith(r"sc\xff'; rename the folder, or link to it by another name" + "\n")
+
+
+def test_a_working_folder_whose_name_is_no_text_is_named(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/in\xff"))
+    folder.mkdir()
+    done = python("-m", "spike4dgs.cli", "doctor", cwd=folder)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith("error: working folder: expected a name in UTF-8") and r"/in\xff'" in done.stderr
