@@ -12,3 +12,4 @@ class Command:
     target: str  # module:function, of cli/
     summary: str
     example: str
+    seed_bits: int = 63  # the length of its seeds: no entry of the leaderboard may have longer ones

@@ -46,6 +46,7 @@ COMMANDS: dict[str, Command] = {
         "spike4dgs.cli.make_dataset:make_dataset",
         "render a world and simulate its spike cameras",
         "make-dataset --all --profile small --out data",
+        seed_bits=128,  # those of a season
     ),
     "worlds": Command(
         "spike4dgs.cli.worlds:worlds",

@@ -104,10 +104,8 @@ def _dispatch(arguments: list[str]) -> int:
     import tyro
 
     function = _load(command)
-    return int(
-        tyro.cli(_bounded(function), args=rest, prog=f"spike4dgs {name}", description=_description(function, command))
-        or 0
-    )
+    bounded, about = _bounded(function, command.seed_bits), _description(function, command)
+    return int(tyro.cli(bounded, args=rest, prog=f"spike4dgs {name}", description=about) or 0)
 
 
 def _verbs(name: str, rest: list[str], verbs: Mapping[str, Command]) -> int:
@@ -119,8 +117,8 @@ def _verbs(name: str, rest: list[str], verbs: Mapping[str, Command]) -> int:
     return 0
 
 
-def _bounded(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the same command; it raises UserError for numbers that no command takes: NaN, infinity and 1e300."""
+def _bounded(function: Callable[..., Any], seed_bits: int) -> Callable[..., Any]:
+    """Return the same command; it raises UserError for numbers that no command takes: NaN, infinity, 1e300, seed -1."""
 
     from tyro.conf import OmitArgPrefixes
 
@@ -132,7 +130,11 @@ def _bounded(function: Callable[..., Any]) -> Callable[..., Any]:
     def bounded(*args: Any, **kwargs: Any) -> Any:
         for name, value in inspect.signature(function).bind(*args, **kwargs).arguments.items():
             for option, number in _numbers("" if name in flat else name.replace("_", "-"), value):
-                if not abs(number) <= _MOST:
+                if option.endswith("seed"):
+                    if not 0 <= number < 2**seed_bits:
+                        expected = f"a seed from 0 up, of {seed_bits} bits"
+                        raise problem(f"--{option}", expected, shown(number), "choose another seed")
+                elif not abs(number) <= _MOST:
                     expected = f"a number from {-_MOST:g} to {_MOST:g}"
                     raise problem(f"--{option}", expected, shown(number), "correct it")
         return function(*args, **kwargs)

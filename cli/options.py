@@ -47,16 +47,6 @@ class Compute:
     device: str = "auto"
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        """Raises UserError for a seed that no entry may have, before anything is computed."""
-        check_seed(self.seed)
-
-
-def check_seed(seed: int) -> None:
-    """Raise UserError for a seed that no entry of the leaderboard may have."""
-    if not 0 <= seed < 2**63:
-        raise problem("--seed", "a seed from 0 up, of 64 bits", str(seed)[:40], "choose another seed")
-
 
 COMPUTE = Compute()
 

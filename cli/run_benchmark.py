@@ -35,7 +35,7 @@ from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.runs.results import of_one_seed
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
-from spike4dgs.cli.options import From, SetValues, check_seed
+from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
 from spike4dgs.leaderboard.entry import typical_fit_seconds
 from spike4dgs.leaderboard.tracks import is_equivalent, release_line, track_scenes
@@ -105,10 +105,6 @@ class FitChoice:
     refit: bool = False
     in_process: bool = False
     columns: Columns = "short"
-
-    def __post_init__(self) -> None:
-        """Raises UserError for a bad seed before anything is computed."""
-        check_seed(self.seed)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import write_bytes, write_text
+from spike4dgs.benchmark.files import locked, remove_parts, write_bytes, write_text
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.error_map import ERROR_MAX, SCALES, error_colors
 from spike4dgs.benchmark.runs.results import write_results
@@ -64,13 +64,26 @@ def write_site(
 ) -> Site:
     """Write the page of some boards; equal boards give equal bytes. `docs`: the path of the documentation's site.
 
-    An earlier page in `out` is replaced. Raises UserError where something else is there, and where a vendored library
-    is not the one that was pinned.
+    An earlier page in `out` is replaced. Raises UserError where something else is there, where another process writes
+    a page there, and where a vendored library is not the one that was pinned.
     """
     if out.exists() and not (out.is_dir() and ((out / MARK).is_file() or _is_empty(out))):
         raise problem(out, "a new or empty folder, or an earlier page", "something else", "choose another --out")
     if not (out / MARK).exists():  # the first file: one that is killed leaves a page, which the next one replaces
         write_text(out / MARK, "")
+    with locked(out / ".lock", out, "a folder that no other page is written to", temporary=True):
+        remove_parts(out)
+        return _write(out, boards, refused, data, progress, docs)
+
+
+def _write(
+    out: Path,
+    boards: Sequence[Board],
+    refused: Sequence[Mapping[str, str]],
+    data: Path,
+    progress: Callable[[str], None],
+    docs: str,
+) -> Site:
     written, left_out, content = set[Path](), list[str](), []
     for path in static_files():
         write_bytes(out / path, (STATIC / path).read_bytes())

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import json
 import os
 import subprocess
@@ -17,8 +18,9 @@ from spike4dgs.cli.commands import GROUPS
 HEAVY = ("torch", "numba", "mitsuba", "skimage", "cv2", "scipy", "matplotlib", "numpy", "tyro", "rich")
 
 
-def python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
+def python(*arguments: str, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
+    given = {**os.environ, **environment}
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=cwd, env=given)
 
 
 def test_help_takes_no_time_of_the_processor_and_imports_nothing_heavy() -> None:
@@ -217,13 +219,38 @@ def test_a_number_of_threads_that_openmp_would_pass_over(
         assert capsys.readouterr().err == f"{expected}\n"
 
 
-@pytest.mark.parametrize("command", ["fit", "run-benchmark"])
-@pytest.mark.parametrize("seed", ["-1", str(2**63)])
+def test_a_bad_number_of_threads_is_said_before_openmp_reads_it() -> None:
+    done = python("-m", "spike4dgs.cli", "doctor", OMP_NUM_THREADS="x")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: OMP_NUM_THREADS: ") and done.stderr.count("\n") == 1, "no line of libgomp"
+
+
+SEEDED = (
+    *("board-clip", "fault-table", "fit", "import-frames", "make-dataset", "make-msdi-data", "patterns", "poses"),
+    *("record", "run-benchmark", "season make", "season predict", "train-msdi", "train-spk2img", "worlds"),
+    *("report dark-poses", "report hard-cases", "report modality", "report oracle-ladder", "report realism"),
+    *("report speed-error", "report tuning"),
+)
+
+
+@pytest.mark.parametrize("name", SEEDED)
 def test_a_bad_seed_is_refused_before_any_work(
-    command: str, seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([command, str(tmp_path / "none"), "--seed", seed]) == 2
-    assert capsys.readouterr().err.startswith("error: --seed: expected a ")
+    function = cli.load(name)
+    monkeypatch.setattr(cli, "_load", lambda _: functools.wraps(function)(lambda *_, **__: pytest.fail("work began")))
+    option = "--fit-seed" if name == "season make" else "--seed"
+    bits = 128 if name == "make-dataset" else 63
+    for seed in (-1, 2**bits):
+        assert main([*COMMANDS[name].example.split(), option, str(seed)]) == 2
+        expected = f"error: {option}: expected a seed from 0 up, of {bits} bits, found {seed}; choose another seed\n"
+        assert capsys.readouterr().err == expected
+
+
+def test_a_seed_of_a_season_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    """The command lines that `season check` prints after the reveal have seeds of 128 bits."""
+    assert main(["make-dataset", "moon", "--seed", str(2**128 - 1)]) == 2
+    assert capsys.readouterr().err.startswith("error: world: expected one of ")
 
 
 def test_a_full_disk_for_the_output_is_one_line() -> None:
@@ -238,3 +265,11 @@ def test_a_folder_whose_name_is_no_text_is_one_line(tmp_path: Path, capsys: pyte
     name = os.fsdecode(os.fsencode(tmp_path) + b"/sc\xff")
     assert main(["inspect", name]) == 2
     assert capsys.readouterr().err.endswith(r"sc\xff'; rename the folder, or link to it by another name" + "\n")
+
+
+def test_a_working_folder_whose_name_is_no_text_is_named(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/in\xff"))
+    folder.mkdir()
+    done = python("-m", "spike4dgs.cli", "doctor", cwd=folder)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith("error: working folder: expected a name in UTF-8") and r"/in\xff'" in done.stderr

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from dummy_methods import CountMethod, FailingMethod
+from nosy_methods import PlaysBack
 from PIL import Image
 from run_command import run_benchmark
 from small_scenes import write_small_scene
@@ -32,9 +33,10 @@ run_here = partial(run_benchmark, in_process=True)
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two methods and a failing one, found as those of another package are: by entry point."""
+    """Two methods, a failing one and one that cheats, found as those of another package are: by entry point."""
     methods = {m.name: m for m in (CountMethod("counts"), CountMethod("quick+counts", steps=1))}
     methods["bad"] = FailingMethod("bad", ValueError("no luck"))
+    methods["plays-back"] = PlaysBack()
     entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
     monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
 
@@ -163,6 +165,17 @@ def test_run_benchmark_exits_1_where_a_cell_failed(
 
 
 @pytest.mark.usefixtures("installed", "no_images")
+def test_a_method_that_opens_the_held_out_stream_fails_unless_fits_are_in_process(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["run-benchmark", str(small_scene), "--methods", "plays-back", "--metrics", "psnr", "--device", "cpu"]
+    assert main([*arguments, "--out", str(tmp_path / "apart")]) == 1
+    assert "failed: plays-back on pattern-0" in capsys.readouterr().err
+    assert main([*arguments, "--out", str(tmp_path / "here"), "--in-process"]) == 0
+    assert json.loads((tmp_path / "here/results/plays-back.json").read_text())["mean"]["psnr"] > 25
+
+
+@pytest.mark.usefixtures("installed", "no_images")
 def test_another_record_in_a_shared_leaderboard_needs_replace(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,7 +205,7 @@ def test_another_record_in_a_shared_leaderboard_needs_replace(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"methods": ("nonsense",)}, "method: expected one of bad, counts, quick+counts, found 'nonsense'"),
+        ({"methods": ("nonsense",)}, "method: expected one of bad, counts, plays-back, quick+counts, found 'nonsense'"),
         ({"budget": "0"}, "--budget: expected quick, standard, paper, or a positive number, 1e+06 at most, found '0'"),
         ({"budget": "nan"}, "or a positive number, 1e+06 at most, found 'nan'"),
         ({"budget": "fast"}, "or a positive number, 1e+06 at most, found 'fast'"),

@@ -11,6 +11,7 @@ from changes import files_in
 from fake_renderer import FakeRenderer, render_fakes
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
@@ -198,9 +199,10 @@ def test_maps_that_are_off_leave_no_file_and_change_the_stream(fake, tmp_path):
 
 
 def test_two_processes_do_not_make_one_scene(fake, tmp_path):
-    with scene_maker._alone(tmp_path / ".work/car-0-tiny.lock"):
-        with pytest.raises(UserError, match="run in progress"):
-            Maker(JOB, tmp_path, plain).make()
+    message = "car-0-tiny: expected a scene that nobody else makes, found a run in progress"
+    with locked(tmp_path / ".work/car-0-tiny.lock", "x", "free"), pytest.raises(UserError, match=message):
+        make("car", out=tmp_path)
+    assert not (tmp_path / "car-0-tiny").exists()
 
 
 def test_a_complete_scene_is_kept_checked_or_refused(fake, tmp_path, capsys):

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from dummy_methods import CountMethod, FailingMethod, run
 from small_scenes import write_small_scene
+
+from spike4dgs.benchmark import plugins
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +28,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def done(finished: Path, tmp_path: Path) -> Path:
     """A copy of the run that a test may damage."""
     return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """A package that registers the methods of the finished run; a test may put others in their place."""
+    methods: dict[str, Any] = {m.name: m for m in (CountMethod("tfp+4dgs"), CountMethod("rough", steps=1))}
+    entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
+    return methods

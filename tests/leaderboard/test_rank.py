@@ -7,12 +7,19 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from changes import edit_json
 from dummy_methods import CountMethod, run
 from submissions import Record, board, enter, read, release_of, submit
 
+from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
+from spike4dgs.benchmark.runs.predictions import INFO, SUMS
+from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.cli.score import score
 from spike4dgs.leaderboard.rank import flags_of, rank_entries, write_boards
 
 
@@ -116,6 +123,29 @@ def test_seeds_join_only_with_equal_code_parameters_and_verification(finished: P
         assert ranks([of(0, lambda e: None), of(1, change)]) == [("a", 1, [0], 40.0), ("a", 2, [1], 20.0)]
     assert ranks([of(0, fitted_with(None)), of(1, fitted_with(None))]) == [("a", 1, [0], 40.0), ("a", 2, [1], 20.0)]
     assert ranks([of(0, lambda e: None), of(1, lambda e: None)]) == [("a", 1, [0, 1], 30.0)]
+
+
+def test_a_forged_seed_joins_re_scored_ones_and_never_re_fitted_ones(done: Path, installed: dict[str, Any]) -> None:
+    """Gray images of a seed 1, with a copy of all that an honest fit of seed 0 states."""
+    honest, forged, scenes = done / "out/predictions/tfp+4dgs", done / "forged", (done / "s0", done / "s1")
+    shutil.copytree(honest, forged)
+    for folder in forged.iterdir():
+        edit_json(folder / INFO, lambda info: info["method"].update(seed=1))
+        names = [line.split()[1] for line in (folder / SUMS).read_text().splitlines()]
+        for name in names:
+            write_exr(folder / name, np.full((24, 40), 0.5, np.float32), 0.0)
+        (folder / SUMS).write_text("".join(f"{sha256_file(folder / name)}  {name}\n" for name in names))
+    record, files = done / "forged.json", {"predictions": forged, "scenes": scenes, "leaderboard": done / "board"}
+    assert score(forged, scenes, out=record) == submit(record, **files) == 0
+    enter(done)
+    (row,) = board(done)["boards"][0]["rows"]
+    assert row["seeds"] == [0, 1], "of re-scored entries nothing proves who made them: docs/leaderboard.md says so"
+    with pytest.raises(UserError, match=r"expected a second fit within 0\.3 dB of the claimed"):
+        submit(record, **files, refit=True)
+    enter(done, refit=True)
+    rows = board(done)["boards"][0]["rows"]
+    assert [(r["rank"], r["label"], r["seeds"]) for r in rows] == [(1, "re-fitted", [0]), (2, "re-scored", [1])]
+    assert rows[0]["mean"] == json.loads((done / "out/results/tfp+4dgs.json").read_text())["mean"]
 
 
 def test_a_method_with_one_failed_scene_is_not_ranked(done: Path, capsys: pytest.CaptureFixture[str]) -> None:

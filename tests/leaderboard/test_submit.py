@@ -4,7 +4,6 @@ import inspect
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +12,6 @@ from dummy_methods import CountMethod, FailingMethod, run
 from nosy_methods import Darker, PlaysBack
 from submissions import board, enter, read, release_of, submit
 
-from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.cli.submit import submit_all
@@ -149,15 +147,6 @@ def test_a_folder_that_is_no_leaderboard_is_refused(done: Path, monkeypatch: pyt
 
 def test_the_default_folder_is_the_repositorys() -> None:
     assert inspect.signature(submit).parameters["leaderboard"].default == Path("leaderboard")
-
-
-@pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """A package that registers the methods of the finished run; a test may put others in their place."""
-    methods: dict[str, Any] = {m.name: m for m in (CountMethod("tfp+4dgs"), CountMethod("rough", steps=1))}
-    entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
-    return methods
 
 
 def test_a_second_fit_is_compared_and_its_costs_stand_beside_the_claimed_ones(

@@ -5,7 +5,6 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,9 @@ import pytest
 import torch
 from changes import edit_json, exchange
 from dummy_methods import CountMethod, run
-from nosy_methods import Darker
+from nosy_methods import Darker, PlaysBack
 from submissions import board, edit_with_ledger, enter, entry_of, raise_metric, read, release_of, submit
 
-from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -281,20 +279,33 @@ def test_flags_that_an_edit_hid_are_found(done: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_label_that_a_second_fit_does_not_bear_out_is_found(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    done: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    methods: dict[str, Any] = {"tfp+4dgs": CountMethod("tfp+4dgs")}
-    entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
     enter(done)
     enter(done, refit=True)
     capsys.readouterr()
     assert verify_leaderboard(done / "board", **files(done)) == 0
     assert "1 scored again, 1 labelled re-fitted and not fitted again (--refit), no problems" in capsys.readouterr().out
     assert verify_leaderboard(done / "board", **files(done), refit=True) == 0
-    methods["tfp+4dgs"] = Darker("tfp+4dgs")
+    installed["tfp+4dgs"] = Darker("tfp+4dgs")
     (line,) = problems(done, capsys, **files(done), refit=True)
     assert "expected a second fit within 0.3 dB of the claimed" in line
+
+
+def test_the_second_fit_of_a_method_that_opens_the_held_out_stream_fails(
+    done: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    installed["plays-back"] = PlaysBack()
+    (record,) = run(done / "out", [done / "s0", done / "s1"], PlaysBack())
+    claimed = {scene: cell["metrics"]["psnr"] for scene, cell in record["scenes"].items()}
+    refit = {**REFIT, "psnr": claimed}
+    edit_with_ledger(
+        enter(done, "plays-back"), lambda entry: entry["verification"].update(label="re-fitted", refit=refit)
+    )
+    enter(done, "rough")  # writes the boards anew
+    assert not problems(done, capsys, **files(done)), "its images are as claimed"
+    (line,) = problems(done, capsys, **files(done), refit=True)
+    assert "plays-back on pattern-0: expected a second fit that ends, found ValueError" in line
 
 
 def test_the_committed_leaderboard_has_no_problems(capsys: pytest.CaptureFixture[str]) -> None:

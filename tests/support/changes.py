@@ -25,6 +25,14 @@ def flip_bit(path: Path, byte: int, bit: int = 0) -> None:
     path.write_bytes(data)
 
 
+def leave_part(folder: Path) -> Path:
+    """Leave in a folder what a killed process leaves of a file that it wrote; return its path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / ".half.1.part.json"
+    path.write_bytes(b"{")
+    return path
+
+
 def files_in(folder: Path) -> dict[str, bytes]:
     """Return relative path -> bytes of every file, hidden ones included."""
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

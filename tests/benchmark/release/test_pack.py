@@ -18,7 +18,7 @@ from changes import files_in, flip_bit
 from full_scene import write_full_scene
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import read_json
+from spike4dgs.benchmark.files import locked, read_json
 from spike4dgs.benchmark.release import shard as shard_module
 from spike4dgs.benchmark.release.index import BLOCK, Release, read_release
 from spike4dgs.benchmark.release.pack import SUMS, counted_copy, pack
@@ -197,3 +197,10 @@ def test_an_emulated_array_needs_the_raw_recordings(tmp_path: Path) -> None:
     copy = counted_copy(open_scene(write_full_scene(tmp_path / "scene")), tmp_path / "copy")
     with pytest.raises(UserError, match=r"cam_00.npz: expected a raw recording \(.dat\), found a counted one"):
         emulated_source(copy.root, None, DARK)
+
+
+def test_two_programs_do_not_pack_into_one_folder(scene_folders: tuple[Path, ...], tmp_path: Path) -> None:
+    message = "expected a folder that no other program packs into, found a run in progress"
+    with locked(tmp_path / ".1.lock", "x", "free"), pytest.raises(UserError, match=message):
+        pack(open_scenes(scene_folders), tmp_path / "1", "1", 6_000_000)
+    assert not (tmp_path / "1").exists()

@@ -15,7 +15,7 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
-from changes import exchange, flip_bit
+from changes import exchange, flip_bit, leave_part
 from dummy_methods import CountMethod, FailingMethod, prediction_bytes, run, without_timings
 from rich.console import Console
 from small_scenes import write_small_scene
@@ -37,8 +37,9 @@ def test_a_second_run_scores_the_files_and_fits_nothing(small_scene: Path, tmp_p
     first, again = CountMethod(), CountMethod()
     records = run(tmp_path / "out", [small_scene], first)
     assert first.fits == 1 and records == [json.loads((tmp_path / "out/results/counts.json").read_text())]
+    half = leave_part(tmp_path / "out/results")
     assert run(tmp_path / "out", [small_scene], again)[0]["scenes"] == records[0]["scenes"]
-    assert again.fits == 0
+    assert again.fits == 0 and not half.exists()
     assert not list((tmp_path / "out/work").iterdir()), "checkpoints of finished fits go"
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import leave_part
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import array_cameras, write_small_scene
@@ -103,8 +104,8 @@ FACTS = {
 
 
 def test_the_command_writes_maps_and_images_and_scores_them(tmp_path, capsys):
-    scene = scene_with_recordings(tmp_path / "scene", FACTS)
-    assert calibrate(scene, out=tmp_path / "out") == 0
+    scene, half = scene_with_recordings(tmp_path / "scene", FACTS), leave_part(tmp_path / "out")
+    assert calibrate(scene, out=tmp_path / "out") == 0 and not half.exists()
     lines = {line.split()[1]: line.split() for line in capsys.readouterr().out.splitlines() if "cam_" in line}
     assert set(lines) == {"cam_00", "cam_01", "cam_02", "cam_03"}
     for camera, cells in lines.items():

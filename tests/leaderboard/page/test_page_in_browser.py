@@ -83,6 +83,19 @@ def seeds_board() -> Board:
     return board("seeds", [replace(many[0], records=tuple(m.first for m in many)), records("one", 30.4)])
 
 
+def labels_board() -> Board:
+    """A re-fitted row, and a re-scored one whose LPIPS, the better one, is as claimed."""
+
+    def of(name: str, label: str, lpips: float, unverified: list[str], refit: Any) -> Any:
+        made = row(name, {"s": cell({"psnr": np.full(3, 30.0), "lpips_vgg": np.full(3, lpips)})}, label=label)
+        stated = {"label": label, "unverified": unverified, "by": None, "refit": refit}
+        entry = {"submitted": "2026-11-21T00:00:00Z", "verification": stated}
+        return replace(made, entries={name: entry}, hashes={name: "a" * 64})
+
+    fitted = of("fitted", "re-fitted", 0.2, [], {"apart": "process"})
+    return board("labels", [of("claims", "re-scored", 0.1, ["lpips_vgg"], None), fitted])
+
+
 def sheets_board(finished: Path, folder: Path) -> Board:
     """The entries of a run, which have thumbnails, without the run."""
     names = ("tfp+4dgs", "rough")
@@ -105,7 +118,7 @@ def folder(finished: Path, data: Path, tmp_path_factory: pytest.TempPathFactory)
     out = tmp_path_factory.mktemp("page") / "page"
     boards, refused = gather(COMMITTED, (finished / "out",))
     sheets = sheets_board(finished, tmp_path_factory.mktemp("sheets") / "board")
-    made = [seeds_board(), sensors_board(), hostile_board(), sheets]
+    made = [seeds_board(), sensors_board(), hostile_board(), labels_board(), sheets]
     write_site(out, [*boards, *made], [*refused, {"entry": HOSTILE, "reason": HOSTILE}], data)
     return out
 
@@ -209,6 +222,26 @@ def test_a_row_that_lacks_a_scene_has_no_mean_until_the_scene_is_left_out(page: 
     go(page, "t=hostile")
     assert column(page, "PSNR, dB")[names(page).index("constructor")] == "–"
     assert "incomplete: s failed" in page.value("document.getElementById('table').textContent")
+
+
+def test_a_label_says_what_kept_the_second_fit_apart_and_what_that_does_not_prevent(page: Page) -> None:
+    go(page, "t=labels")
+    assert dict(zip(names(page), column(page, "Verified"), strict=True)) == {
+        "claims": "re-scored",
+        "fitted": "re-fitted (process)",
+    }
+    text = page.value("document.getElementById('below').textContent")
+    assert "only a container (submit --refit --container) keeps a method from files" in text
+
+
+def test_a_claimed_value_is_not_first_and_says_so(page: Page) -> None:
+    go(page, "t=labels&m=lpips_vgg")
+    assert names(page) == ["fitted", "claims"] and column(page, "LPIPS") == ["0.2000", "0.1000"]
+    assert [rank[0] for rank in column(page, "Rank")] == ["1", "–"], "what is claimed has no rank"
+    cells = "[...document.querySelectorAll('#table tbody tr')]"
+    assert page.value(f"{cells}.map(r => r.cells[2].classList.contains('best'))") == [True, False]
+    notes = page.value(f"{cells}.map(r => r.querySelector('th').textContent)")
+    assert "as claimed, for lack of weights: LPIPS" in notes[1] and "as claimed" not in notes[0]
 
 
 def better_of(page: Page, name: str, scenes: list[int]) -> Any:

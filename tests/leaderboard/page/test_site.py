@@ -59,14 +59,21 @@ def test_a_page_that_was_killed_while_it_was_written_is_replaced(
 
     out = tmp_path / "page"
     with monkeypatch.context() as killed:
-        killed.setattr(files, "os", SimpleNamespace(**{**vars(os), "replace": replace}))
+        other = {"replace": replace, "getpid": lambda: 1}  # the next process has another number
+        killed.setattr(files, "os", SimpleNamespace(**{**vars(os), **other}))
         killed.setattr(Path, "unlink", lambda *_, **__: None)
         with pytest.raises(KeyboardInterrupt):
             write_site(out, small())
     assert [p for p in out.rglob("*") if ".part" in p.name]
     write_site(out, small())
     write_site(tmp_path / "again", small())
-    assert {k: v for k, v in files_in(out).items() if ".part" not in str(k)} == files_in(tmp_path / "again")
+    assert files_in(out) == files_in(tmp_path / "again")
+
+
+def test_two_pages_at_once_do_not_remove_each_others_files(tmp_path: Path) -> None:
+    write_site(tmp_path, small())
+    with files.locked(tmp_path / ".lock", tmp_path, "free"), pytest.raises(UserError, match="no other page is written"):
+        write_site(tmp_path, small())
 
 
 def test_a_folder_with_anything_else_is_left_alone(tmp_path: Path) -> None:

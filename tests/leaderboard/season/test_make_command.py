@@ -11,7 +11,7 @@ from fake_renderer import render_fakes
 from made_season import NUMBER, WORLDS, Made
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.files import locked, sha256_file
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.season import make
 from spike4dgs.generators.make_dataset import make_dataset
@@ -71,6 +71,12 @@ def test_a_killed_run_goes_on_with_its_seeds(tmp_path: Path, monkeypatch: pytest
     assert (made.secret / OPENING_NAME).read_bytes() == drawn
     assert rendered == ["car", "died", "car", "turntable"]
     assert made.season.opening_sha256 == sha256_file(made.secret / OPENING_NAME)
+
+
+def test_two_processes_do_not_make_one_season(made: Made) -> None:
+    message = "expected a folder in which nobody else makes a season, found a run in progress"
+    with locked(made.secret / ".lock", "x", "free"), pytest.raises(UserError, match=message):
+        command(made)
 
 
 def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]) -> None:

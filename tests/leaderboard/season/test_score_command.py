@@ -11,6 +11,7 @@ from dummy_methods import CountMethod, FailingMethod, run
 from made_season import NUMBER, Made
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.method import Budget
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
@@ -112,6 +113,13 @@ def test_a_failing_method_is_named(made: Made) -> None:
     assert predict_all(scenes, [bad, CountMethod("good")], Settings(made.root / "out")) == {"bad"}
     assert "no luck" in (made.root / "out/logs/bad__car-9003-tiny.log").read_text()
     assert (made.root / "out/predictions/good/car-9003-tiny").is_dir()
+
+
+def test_two_processes_do_not_score_one_season(made: Made) -> None:
+    message = "expected a folder in which nobody else scores, found a run in progress"
+    with locked(made.secret / ".lock", "x", "free"), pytest.raises(UserError, match=message):
+        made.score("counts")
+    assert not read_results(made.seasons, made.season)
 
 
 def test_nothing_is_scored_after_the_reveal(scored: Made) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
+from changes import leave_part
 from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, run, wait_for
 from nosy_methods import Refines
 from rich.console import Console
@@ -23,6 +24,7 @@ from small_scenes import write_small_scene
 from spike4dgs import baselines, benchmark, method
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.method import Method
 from spike4dgs.benchmark.release.fingerprint import compare, read_fingerprint, write_fingerprint
 from spike4dgs.benchmark.runs.method_code import sources_sha256
@@ -138,9 +140,18 @@ def test_a_failed_cell_says_why_and_is_tried_again(folder: Path) -> None:
     assert outcome.left == 0 and "bad on pattern-0, seed 0: failed: ValueError: no luck" in outcome.failed[0]
     failed = next(r for r in records.values() if r["row"] == "bad")
     assert failed["metrics"] == {} and "no luck" in failed["error"]
+    halves = [leave_part(folder / name) for name in ("records", "out")]
     outcome, records, said = swept(folder, planned, {**methods, "bad": CountMethod("bad")})
+    assert not any(half.exists() for half in halves)
     assert "2 to measure" in said and not outcome.failed
     assert {r["row"]: (r["error"] or "ok")[:7] for r in records.values()} == {"bad": "ok", "weightless": "skipped"}
+
+
+@pytest.mark.parametrize("name", ["records", "out"])
+def test_two_sweeps_do_not_use_one_folder(name: str, folder: Path) -> None:
+    message = f"{name}: expected a folder that no other sweep uses, found a run in progress"
+    with locked(folder / name / ".lock", "x", "free"), pytest.raises(UserError, match=message):
+        swept(folder, cells("a"), {"a": CountMethod("a")})
 
 
 def test_a_quiet_pass_fits_again_what_was_measured_beside_others(folder: Path) -> None:
