@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +29,10 @@ from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
 from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.tables import conditions as on_conditions
-from spike4dgs.studies.results.tables.breaks import LEVELS, NAMED, NONE, amount_text
+from spike4dgs.studies.results.tables.breaks import LEVELS, NAMED, amount_text
 from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
 from spike4dgs.studies.results.tables.ceilings import ceiling_row
-from spike4dgs.studies.results.tables.conditions import Condition, rows_under
+from spike4dgs.studies.results.tables.conditions import NONE, Condition, rows_under
 from spike4dgs.studies.results.tables.modality import plot_modality
 from spike4dgs.studies.results.tables.published import given_row
 
@@ -151,7 +150,7 @@ def _curve(
     found = {}
     for amount, level in levels.items():
         condition = NAMED[level]
-        values = [mean(c) for c in (condition, replace(NONE, worlds=condition.worlds), NONE)]
+        values = [mean(c) for c in (condition, condition.absent, NONE)]
         if None not in values:
             there, without, both = values
             found[amount] = both + there - without

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from statistics import fmean
 
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import make_budget
@@ -12,7 +11,7 @@ from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
 from spike4dgs.method.recipes import METHODS as OURS
 from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, Ranking, differences, lead, rank, rows_of
+from spike4dgs.studies.results.comparison import BOTH, RANKED_BY, MeasuredRow, Ranking, changes, lead, rank, rows_of
 from spike4dgs.studies.results.plan import ALL_ROWS, KNOWLEDGE, TABLE1, TABLE2, Group, cells_of
 from spike4dgs.studies.results.records import DIGITS, Record
 
@@ -21,7 +20,6 @@ NO_LEAD = "No row of ours and another with equal knowledge have been measured on
 NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes), ALL_ROWS)
 SMALL_NETWORK = "`spk2img` is a small network that we trained: width 8, published 64, and 2,500 steps."
 _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
-BOTH = ("psnr", RANKED_BY)
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
 _LEGEND = (
     "Ranks are by PSNR where things move; rows that the intervals do not tell apart share them. After ± is half of a "
@@ -196,10 +194,9 @@ def both_text(row: MeasuredRow) -> str:
 
 
 def change_text(row: MeasuredRow, other: MeasuredRow) -> str:
-    """Return by how much a row is ahead of another, as `both_text`; "-" where either is incomplete."""
-    if not (row.is_complete and other.is_complete):
-        return "-"
-    return " / ".join(f"{fmean(differences(row, other, metric)):+.2f}" for metric in BOTH)
+    """Return `changes` as `both_text` has values; "-" where there are none."""
+    found = changes(row, other)
+    return "-" if found is None else " / ".join(f"{change:+.2f}" for change in found)
 
 
 def _lead_text(row: MeasuredRow, rivals: Sequence[MeasuredRow]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from statistics import fmean
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from spike4dgs.leaderboard.page.intervals import Comparison, compare
 from spike4dgs.studies.results.records import Record
 
 RANKED_BY = "psnr_dynamic"  # where things move is what the cameras are for
+BOTH = ("psnr", RANKED_BY)  # of the whole image, and where things move
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,16 @@ def differences(one: MeasuredRow, other: MeasuredRow, metric: str) -> list[float
     """Return the first's mean over seeds less the other's for each scene of complete rows, their scenes in order."""
     pairs = zip(one.values(metric) or (), other.values(metric) or (), strict=True)
     return [float(a.mean() - b.mean()) for a, b in pairs]
+
+
+def changes(row: MeasuredRow, other: MeasuredRow) -> list[float] | None:
+    """Return by how much a row is ahead of another in the whole image and where things move, dB, means over scenes.
+
+    None where either is incomplete.
+    """
+    if not (row.is_complete and other.is_complete):
+        return None
+    return [fmean(differences(row, other, metric)) for metric in BOTH]
 
 
 def rank(rows: Sequence[MeasuredRow]) -> Ranking:

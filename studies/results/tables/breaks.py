@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from statistics import fmean
 
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import BOTH, NOTHING, commits_text, of_group
-from spike4dgs.studies.results.comparison import differences
+from spike4dgs.studies.results.blocks import NOTHING, commits_text, of_group
+from spike4dgs.studies.results.comparison import changes
 from spike4dgs.studies.results.records import Record
-from spike4dgs.studies.results.tables.conditions import CONDITIONS, GROUP, Condition, of_conditions, rows_under
+from spike4dgs.studies.results.tables.conditions import CONDITIONS, GROUP, NONE, Condition, of_conditions, rows_under
 
 BROKEN_DB = 3  # twice the error
 NAMED = {condition.name: condition for condition in CONDITIONS}
-NONE = CONDITIONS[0]
 LEVELS: dict[str, dict[float, str]] = {  # a cause -> the names of its conditions, by amount
     "light": {1 / 64: "light 1/64", 1 / 16: "light 1/16", 1 / 4: "light 1/4", 1: NONE.name, 2: "light times 2"},
     "speed": {1: NONE.name, 2: "twice as fast", 4: "four times as fast"},
@@ -60,23 +57,17 @@ def _sides() -> Iterator[tuple[str, dict[float, str]]]:
 
 
 def _broken(name: str, side: Mapping[float, str], own: Sequence[Record]) -> str:
-    changes = {amount: change for amount, level in side.items() if (change := _changes(name, NAMED[level], own))}
-    if not changes:
+    measured = {amount: change for amount, level in side.items() if (change := _changes(name, NAMED[level], own))}
+    if not measured:
         return "-"
-    found = []
-    for k in range(len(BOTH)):
-        broken = [amount for amount, change in changes.items() if change[k] <= -BROKEN_DB]
-        found.append(amount_text(broken[0]) if broken else "no")
-    return " / ".join(found)
+    broken = [[a for a, change in measured.items() if change[k] <= -BROKEN_DB] for k in (0, 1)]
+    return " / ".join(amount_text(amounts[0]) if amounts else "no" for amounts in broken)
 
 
 def _changes(name: str, condition: Condition, own: Sequence[Record]) -> list[float] | None:
-    """Return what a condition changes for a row, dB, by `BOTH`; None where it was not measured."""
-    pair = (rows_under([name], c, own)[0] for c in (condition, replace(NONE, worlds=condition.worlds)))
-    row, without = pair
-    if not (row.is_complete and without.is_complete):
-        return None
-    return [fmean(differences(row, without, metric)) for metric in BOTH]
+    """Return what a condition changes for a row, as `changes`; None where it was not measured."""
+    row, without = (rows_under([name], c, own)[0] for c in (condition, condition.absent))
+    return changes(row, without)
 
 
 def _others(own: Sequence[Record], names: Sequence[str]) -> str:

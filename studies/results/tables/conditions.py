@@ -54,9 +54,15 @@ class Condition:
         suffix = tyro.cli(PhysicsOptions, args=self.physics.split()).physics().suffix
         return tuple(f"{world}-small{'' if self.ms is None else f'-{self.ms}ms'}{suffix}" for world in self.worlds)
 
+    @property
+    def absent(self) -> Condition:
+        """No condition, in the same worlds."""
+        return replace(NONE, worlds=self.worlds)
 
+
+NONE = Condition("none")
 CONDITIONS = (
-    Condition("none"),
+    NONE,
     Condition("lens, known", "--lens -0.2 0.03 --lens-spread 0.5"),
     Condition("blur of 0.5 px", "--psf-px 0.5"),
     Condition("poses 0.1 px off", "--pose-noise-deg 0.025"),
@@ -103,7 +109,7 @@ VIEWS = tuple(
     for condition in CONDITIONS
     if condition.split != DEFAULT_SPLIT
 )
-EVERY = (GROUP, REFINED, *VIEWS)
+_EVERY = (GROUP, REFINED, *VIEWS)
 CONTENT = Group("content", "Hard content", tuple(f"{world}-1-small" for world in HARD), GROUP.rows)
 CEILINGS = Group("ceilings", "Noise of the truth", (*GROUP.scenes, *CONTENT.scenes), (Row(CEILING, 1, NOT_TUNED),))
 _NOISE = "noise of the truth"
@@ -118,12 +124,11 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
     own = of_conditions(records)
     if not own:
         return [NOTHING]
-    none, *others = CONDITIONS
-    first = [row for row in rows_under([row.name for row in GROUP.rows], none, own) if row.is_complete]
+    first = [row for row in rows_under([row.name for row in GROUP.rows], NONE, own) if row.is_complete]
     names = [row.name for row in first]
-    lines = [[none.name, "", *map(both_text, first), _ceiling(none, records)]]
-    for condition in others:
-        rows, without = (rows_under(names, c, own) for c in (condition, replace(none, worlds=condition.worlds)))
+    lines = [[NONE.name, "", *map(both_text, first), _ceiling(NONE, records)]]
+    for condition in CONDITIONS[1:]:
+        rows, without = (rows_under(names, c, own) for c in (condition, condition.absent))
         if any(row.is_complete for row in rows):
             changes = map(change_text, rows, without)
             lines.append([condition.name, f"`{condition.options}`", *changes, _ceiling(condition, records)])
@@ -132,12 +137,12 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         f"others its change; a prediction without error has the PSNR of the {_NOISE}."
     )
-    return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *EVERY)]
+    return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *_EVERY)]
 
 
 def of_conditions(records: Sequence[Record]) -> list[Record]:
     """Return the records of all conditions."""
-    return [record for group in EVERY for record in of_group(group, records)]
+    return [record for group in _EVERY for record in of_group(group, records)]
 
 
 def _ceiling(condition: Condition, records: Sequence[Record]) -> str:
