@@ -8,15 +8,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from rich.console import Console
 from rich.progress import Progress
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
-from spike4dgs.benchmark.runs.executors import Run, executor
+from spike4dgs.benchmark.runs.executors import Run, executor, here
 from spike4dgs.benchmark.scene.cameras import check_lens
 from spike4dgs.benchmark.scene.manifest import read_manifest
 from spike4dgs.benchmark.scene.scene import SCHEMA
@@ -167,40 +168,68 @@ def make_dataset(
             if job.physics.moves_array and world_of(job).flash:
                 fix = "leave out --array-motion and --array-rotation"
                 raise problem("an array that moves", "a world in steady light", job.world, fix)
+    plans = _planned(jobs, todo, audit)
+    apart = len(plans) // workers * workers if workers > 1 and scheduler is None else 0
     with executor(workers, scheduler) as run:
-        making = partial(_make, run=run, in_process=workers == 1 and scheduler is None, console=console)
-        renderings = Counter(map(rendering_of, jobs))
-        left = Counter(map(rendering_of, todo))
-        for number, job in enumerate(todo, start=1):
-            which = f" ({number} of {len(todo)})" if len(todo) > 1 else ""
-            left[rendering_of(job)] -= 1
-            shared = (renderings[rendering_of(job)] > 1, left[rendering_of(job)] == 0)
-            making(job, out, with_audit=audit, which=which, shared=shared)
+        for _ in run(_MakeScenes(out), plans[:apart]):
+            pass
+        making = partial(_make, out=out, run=run, in_process=workers == 1 and scheduler is None, console=console)
+        for plan in plans[apart:]:
+            for one in plan:
+                making(one)
 
         def make(job: Job, folder: Path) -> None:
             if not _is_done(job, folder, False):
-                making(job, folder, with_audit=False, which=", other noise")
+                making(_Planned(job, False, ", other noise"), out=folder)
 
         return check_scenes(jobs, out, references, make) if check else 0
 
 
-def _make(
-    job: Job,
-    out: Path,
-    *,
-    run: Run,
-    in_process: bool,
-    console: Any,
-    with_audit: bool,
-    which: str,
-    shared: tuple[bool, bool] = (False, False),
-) -> None:
-    """Make one scene and its report. `shared`: whether others have its rendering too, and whether they are all made."""
-    start, (has_others, is_last) = time.perf_counter(), shared
-    with _stages(console, job.id + which) as watch:
-        maker = (SharingMaker if has_others else Maker)(job, out, watch, run, with_audit, in_process)
+class _Planned(NamedTuple):
+    """A scene to make."""
+
+    job: Job
+    audit: bool
+    which: str  # of all, as its title says
+    has_others: bool = False  # scenes of its rendering
+    is_last: bool = True  # of them
+
+
+def _planned(jobs: Sequence[Job], todo: Sequence[Job], audit: bool) -> list[list[_Planned]]:
+    """Return the scenes that are to be made, those of one rendering together."""
+    renderings = Counter(map(rendering_of, jobs))
+    plans: dict[Job, list[_Planned]] = {}
+    for job in todo:
+        plans.setdefault(rendering_of(job), []).append(_Planned(job, audit, "", renderings[rendering_of(job)] > 1))
+    number = count(1)
+    return [
+        [
+            one._replace(which=f" ({next(number)} of {len(todo)})" if len(todo) > 1 else "", is_last=one is plan[-1])
+            for one in plan
+        ]
+        for plan in plans.values()
+    ]
+
+
+@dataclass(frozen=True)
+class _MakeScenes:
+    """Makes whole scenes one after another, on the core of a worker process: no worker waits for another."""
+
+    out: Path
+
+    def __call__(self, plan: Sequence[_Planned]) -> None:
+        console = Console(highlight=False, soft_wrap=True, force_terminal=False, force_jupyter=False)
+        for one in plan:
+            _make(one, out=self.out, run=here, in_process=True, console=console)
+
+
+def _make(one: _Planned, *, out: Path, run: Run, in_process: bool, console: Any) -> None:
+    """Make one scene and its report."""
+    start, job = time.perf_counter(), one.job
+    with _stages(console, job.id + one.which) as watch:
+        maker = (SharingMaker if one.has_others else Maker)(job, out, watch, run, one.audit, in_process)
         folder = maker.make()
-    if isinstance(maker, SharingMaker) and is_last:
+    if isinstance(maker, SharingMaker) and one.is_last:
         maker.forget()
     total = time.perf_counter() - start
     report = {"scene": job.id, "stages_s": maker.seconds, "total_s": round(total, 2), "settings": job.settings}

@@ -47,7 +47,8 @@ class MitsubaScene:
 
     `opaque` is `empty` without glass. `reflectors` are the mirrors alone and the panes alone; None: there are none.
 
-    `full` and `movers` are at the time of the last `set_time`. The moving surfaces are a few plain meshes with updated
+    `full` and `movers` are at the time of the last `set_time`. With `keeps_buffers` their vertices are always in the
+    same memory, so that `dr.freeze` may record what reads them. The moving surfaces are a few plain meshes with updated
     vertices, never Mitsuba's instances: every kernel launch visits each instance, and for a figure of a dozen limbs
     that takes longer than tracing its pixels.
     """
@@ -73,8 +74,8 @@ class MitsubaScene:
         solid = {k: part for k, part in world.static.items() if k not in panes}
         self.opaque = mi.load_dict({"type": "scene", **lamps, **_shapes("solid", solid)}) if panes else self.empty
         self._parameters = [mi.traverse(scene) for scene in (self.full, self.movers)]
-        # the scalar variants compute their own normals whenever positions are set, so ours have to come after that
-        self._own_normals = str(mi.variant()).startswith("scalar")
+        self._buffers: list[dict[str, Any]] = [{} for _ in self._parameters]  # of each: what Mitsuba reads, as NumPy's
+        self.keeps_buffers = str(mi.variant()).startswith("llvm")  # Mitsuba reads NumPy's memory
         self._time_s: float | None = None
         self.set_time(0.0)
 
@@ -114,18 +115,41 @@ class MitsubaScene:
         """Move the moving surfaces of `full` and `movers` to their positions at `t_s` seconds."""
         if t_s == self._time_s:
             return
-        turns = self._turns(t_s)
-        moved = {f"moving_{name}": batch.at(t_s, turns) for name, batch in self._batches.items()}
-        for parameters in self._parameters:
-            for name, (positions, _) in moved.items():
-                parameters[f"{name}.vertex_positions"] = aligned(positions)
-            if self._own_normals:
-                parameters.update()
-            for name, (_, normals) in moved.items():
-                if normals is not None:
-                    parameters[f"{name}.vertex_normals"] = aligned(normals)
-            parameters.update()
+        turns, positions, normals = self._turns(t_s), {}, {}
+        for name, batch in self._batches.items():
+            positions[f"moving_{name}.vertex_positions"], own = batch.at(t_s, turns)
+            if own is not None:
+                normals[f"moving_{name}.vertex_normals"] = own
+        if not self.keeps_buffers:
+            self._replace(positions, normals)
+        else:
+            self._write(positions | normals)
+            if computed := [f"moving_{name}.vertex_normals" for name, b in self._batches.items() if b.lacks_normals]:
+                self._write({name: np.array(self._parameters[0][name]) for name in computed})
         self._time_s = t_s
+
+    def _replace(self, positions: Mapping[str, np.ndarray], normals: Mapping[str, np.ndarray]) -> None:
+        """Give the meshes new buffers; normals last, as the scalar variants compute theirs when positions are set."""
+        for parameters in self._parameters:
+            for values in (positions, normals):
+                for name, array in values.items():
+                    parameters[name] = aligned(array)
+                parameters.update()
+
+    def _write(self, values: Mapping[str, np.ndarray]) -> None:
+        """Write into the meshes' buffers, which stay where they are: what `dr.freeze` recorded has their addresses."""
+        import drjit as dr
+
+        mi = load_mitsuba()
+        dr.sync_thread()  # a kernel may still read them
+        for parameters, buffers in zip(self._parameters, self._buffers, strict=True):
+            for name, array in values.items():
+                if name not in buffers:
+                    buffers[name] = (own := aligned(array)), mi.Float(own)
+                buffers[name][0][...] = array
+                parameters[name] = buffers[name][1]
+                parameters.set_dirty(name)  # the same buffer, so nothing else says that it has changed
+            parameters.update()
 
     def _turns(self, t_s: float) -> np.ndarray:
         """Return the poses [instances, 3, 4] at a time."""
@@ -152,6 +176,11 @@ class _Batch:
     normals: np.ndarray | None
     objects: np.ndarray
     vertices: Callable[[float], np.ndarray] | None = None
+
+    @property
+    def lacks_normals(self) -> bool:
+        """True where Mitsuba computes those of a smooth surface."""
+        return self.merged.smooth and self.normals is None
 
     def part(self, dressed: bool) -> Part:
         """Return the mesh, with its material if `dressed`."""

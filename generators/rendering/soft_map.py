@@ -7,6 +7,7 @@ the pixels around it there. Those count that see a like surface: a similar norma
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import drjit as dr
@@ -20,7 +21,8 @@ from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene, aligned
 LEAST_WEIGHT = 0.02  # of like surfaces around a sample, of at most 1; below it a sample traces its path
 
 
-class SoftMap(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class SoftMap:
     """Soft light at the centres of all pixels, at one time, in the tracer's memory."""
 
     planes: mi.Float  # [N * 4] unit normal, and its product with the position; 0 without a surface
@@ -53,26 +55,39 @@ class Place(NamedTuple):
 Light = tuple[mi.Color3f, mi.Color3f, mi.Float]  # weighted sums of matte light and of gloss, and the weight
 
 
+@dataclass(frozen=True, eq=False)
 class SoftMaps:
-    """The views and the moving surfaces, with which samples find their place in a map."""
+    """The views and the moving surfaces, with which samples find their place in a map; a tree of arrays."""
 
-    def __init__(self, scene: MitsubaScene, cameras: Sequence[Camera]) -> None:
-        self._width, self._height = cameras[0].width, cameras[0].height
+    width: int
+    height: int
+    moving: list[tuple[mi.ShapePtr, int]]  # the surfaces, and the first of `faces` of each
+    faces: mi.UInt32  # [F * 4] vertices of a face, and a number that nobody reads
+    cameras: mi.Float  # [C * 21]
+    has_lens: bool
+
+    @staticmethod
+    def of(scene: MitsubaScene, cameras: Sequence[Camera]) -> SoftMaps:
+        """Return those of a scene and its cameras."""
         by_id = {shape.id(): shape for shape in scene.full.shapes()}
-        self._moving = [(mi.ShapePtr(by_id[name]), first) for name, first in scene.first_faces().items()]
         faces = np.zeros((len(scene.moving_faces), 4), np.uint32)
         faces[:, :3] = scene.moving_faces
-        self._faces = mi.UInt32(aligned(faces.ravel()))
         rows = [[*c.R.ravel(), *c.t, c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)] for c in cameras]
-        self._cameras = mi.Float(aligned(np.array(rows, np.float32).ravel()))  # [C, 21]
-        self._has_lens = any(c.distortion for c in cameras)
+        return SoftMaps(
+            cameras[0].width,
+            cameras[0].height,
+            [(mi.ShapePtr(by_id[name]), first) for name, first in scene.first_faces().items()],
+            mi.UInt32(aligned(faces.ravel())),
+            mi.Float(aligned(np.array(rows, np.float32).ravel())),
+            any(c.distortion for c in cameras),
+        )
 
     def place(
         self,
         view: mi.UInt32,
         si: mi.SurfaceInteraction3f,
         hit: mi.PreliminaryIntersection3f,
-        share: float,
+        share: mi.Float,
         known: SoftMap,
         moving: bool,
         active: mi.Bool,
@@ -81,7 +96,7 @@ class SoftMaps:
         point, normal = mi.Vector3f(si.p), mi.Vector3f(si.n)
         if moving:
             point, normal = self._carried(hit, point, normal, known.corners, active)
-        return Place(dr.opaque(mi.Float, share), known, point, normal, *self._project(view, point))
+        return Place(share, known, point, normal, *self._project(view, point))
 
     def looked_up(self, view: mi.UInt32, places: Sequence[Place], active: mi.Bool) -> Light:
         """Return the weighted sums around each sample: bilinear, over like surfaces."""
@@ -108,8 +123,8 @@ class SoftMaps:
     ) -> Light:
         """Return the sums with a map's light in one pixel, where it sees a like surface."""
         x, y = mi.Int32(column), mi.Int32(row)
-        inside = active & (x >= 0) & (y >= 0) & (x < self._width) & (y < self._height)
-        at = (view * self._height + mi.UInt32(y)) * self._width + mi.UInt32(x)
+        inside = active & (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
+        at = (view * self.height + mi.UInt32(y)) * self.width + mi.UInt32(x)
         plane = dr.gather(mi.Vector4f, place.known.planes, at, inside)
         normal = mi.Vector3f(plane.x, plane.y, plane.z)
         like = inside & (dr.dot(normal, place.normal) > LIKE_COSINE)
@@ -132,11 +147,11 @@ class SoftMaps:
     ) -> tuple[mi.Vector3f, mi.Vector3f]:
         """Return the point and normal at the time of `corners`; those of static surfaces stay."""
         moves, face = mi.Bool(False), hit.prim_index
-        for shape, first in self._moving:
+        for shape, first in self.moving:
             mine = active & (hit.shape == shape)
             moves |= mine
             face = dr.select(mine, hit.prim_index + first, face)
-        numbers = [dr.gather(mi.UInt32, self._faces, 4 * face + k, moves) for k in range(3)]
+        numbers = [dr.gather(mi.UInt32, self.faces, 4 * face + k, moves) for k in range(3)]
         a, b, c = (dr.gather(mi.Vector4f, corners, n, moves) for n in numbers)
         a, b, c = (mi.Vector3f(p.x, p.y, p.z) for p in (a, b, c))
         u, v = hit.prim_uv.x, hit.prim_uv.y
@@ -145,18 +160,18 @@ class SoftMaps:
 
     def _project(self, view: mi.UInt32, point: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return column and row of a point, 0 at the centre of the first pixel, and the width of a pixel there in m."""
-        r = [dr.gather(mi.Float, self._cameras, view * 21 + k) for k in range(12)]
+        r = [dr.gather(mi.Float, self.cameras, view * 21 + k) for k in range(12)]
         x, y, z = (r[3 * k] * point.x + r[3 * k + 1] * point.y + r[3 * k + 2] * point.z + r[9 + k] for k in range(3))
         x, y = x / z, y / z
-        if self._has_lens:
-            k1, k2, p1, p2, k3 = (dr.gather(mi.Float, self._cameras, view * 21 + k) for k in range(16, 21))
+        if self.has_lens:
+            k1, k2, p1, p2, k3 = (dr.gather(mi.Float, self.cameras, view * 21 + k) for k in range(16, 21))
             s = x * x + y * y
             radial = 1 + s * (k1 + s * (k2 + s * k3))
             x, y = (
                 x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x),
                 y * radial + 2 * p2 * x * y + p1 * (s + 2 * y * y),
             )
-        fx, fy, cx, cy = (dr.gather(mi.Float, self._cameras, view * 21 + k) for k in range(12, 16))
+        fx, fy, cx, cy = (dr.gather(mi.Float, self.cameras, view * 21 + k) for k in range(12, 16))
         return x * fx + cx - 0.5, y * fy + cy - 0.5, z / fx
 
 

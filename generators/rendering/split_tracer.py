@@ -25,7 +25,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene
 from spike4dgs.generators.rendering.soft_map import LEAST_WEIGHT, SoftMap, SoftMaps
-from spike4dgs.generators.rendering.wavefront import LANES, Counts, WavefrontTracer
+from spike4dgs.generators.rendering.wavefront import LANES, Counts, Samples, Views, WavefrontTracer
 
 PILOT = 4  # samples from which the number of a pixel's samples is chosen, a power of two
 _LEAST_ALBEDO = 1e-3
@@ -45,8 +45,11 @@ class SplitTracer(WavefrontTracer):
         self._has_lamp = any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in scene.empty.emitters())
         self._all, self._matte, self._glossy = mi.BSDFContext(), mi.BSDFContext(), mi.BSDFContext()
         self._matte.type_mask, self._glossy.type_mask = mi.BSDFFlags.Diffuse, mi.BSDFFlags.Glossy
-        self._maps = SoftMaps(scene, cameras)
+        self._maps = SoftMaps.of(scene, cameras)
         self.most_light = _MOST_LIGHT
+        # Tracing the program of a launch takes as long as a third of a key's samples, so it is recorded once.
+        recorded = dr.freeze if scene.keeps_buffers else lambda function: function
+        self._radiance_of, self._soft_of = recorded(self._radiance), recorded(self._soft)
 
     # ------------------------------------------------------------ the parts
 
@@ -54,27 +57,26 @@ class SplitTracer(WavefrontTracer):
         self, pixels: np.ndarray, spp: Counts, stream: Counts, moving: bool, maps: Sequence[tuple[float, SoftMap]]
     ) -> np.ndarray:
         """Return the linear RGB radiance [K, 3] float32, with soft light of `maps` (weight, map), blended."""
-        parts = [np.zeros((0, 3), np.float32)]
+        parts, known = [np.zeros((0, 3), np.float32)], _opaque(maps)
         for some, counts, streams in _launches(pixels, spp, stream):
-            view, sampler, ray = self._camera_samples(some, counts, streams)
-            parts.append(self._means(self._radiance(view, sampler, ray, moving, maps), counts))
+            radiance = self._radiance_of(*self._launch_of(some, counts, streams, moving), moving, self._maps, known)
+            parts.append(self._means(radiance, counts))
         return np.concatenate(parts)
 
     def spread(
         self, pixels: np.ndarray, stream: Counts, moving: bool, maps: Sequence[tuple[float, SoftMap]]
     ) -> np.ndarray:
         """Return the standard deviations [K] of PILOT samples of each pixel's gray radiance, as `split` has them."""
-        parts = [np.zeros((0, PILOT), np.float32)]
-        for some, counts, streams in _launches(pixels, PILOT, stream):
-            view, sampler, ray = self._camera_samples(some, counts, streams)
-            radiance = self._radiance(view, sampler, ray, moving, maps)
+        parts, known = [np.zeros((0, PILOT), np.float32)], _opaque(maps)
+        for some, _, streams in _launches(pixels, PILOT, stream):
+            radiance = self._radiance_of(*self._launch_of(some, PILOT, streams, moving), moving, self._maps, known)
             dr.eval(radiance)
             parts.append(gray(np.stack([np.array(c, np.float32) for c in radiance], 1)).reshape(-1, PILOT))
         return np.asarray(np.concatenate(parts).std(1, ddof=1))
 
     def surfaces(self, pixels: np.ndarray, moving: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the points and normals [K, 3] that the centres of `pixels` see (0: nothing), and which have a coat."""
-        _, _, ray = self._camera_samples(pixels, 1, 0, centre=True)
+        _, _, ray = self._views.samples(self._lanes(pixels, 1, 0), centre=True)
         si = self._scene_at(moving).ray_intersect(ray)
         points, normals = (dr.select(si.is_valid(), a, 0) for a in (si.p, si.n))
         shiny = dr.select(_lobes(si, si.bsdf(ray))[1], mi.UInt32(1), 0)
@@ -86,18 +88,24 @@ class SplitTracer(WavefrontTracer):
         """Return soft light [K, 3] at the centres of `pixels`, means of paths: gloss, or matte over albedo."""
         parts = [np.zeros((0, 3), np.float32)]
         for some, counts, streams in _launches(pixels, spp, stream):
-            _, sampler, ray = self._camera_samples(some, counts, streams, centre=True)
-            parts.append(self._means(self._soft(sampler, ray, moving, gloss), counts))
+            light = self._soft_of(*self._launch_of(some, counts, streams, moving), gloss)
+            parts.append(self._means(light, counts))
         return np.concatenate(parts)
 
     # ------------------------------------------------------------ internals
 
+    def _launch_of(
+        self, pixels: np.ndarray, spp: Counts, stream: Counts, moving: bool
+    ) -> tuple[mi.Scene, Views, Samples]:
+        """Return the inputs of a launch."""
+        return self._scene_at(moving), self._views, self._lanes(pixels, spp, stream)
+
     def _scene_at(self, moving: bool) -> mi.Scene:
         return self._scene.full if moving else self._scene.empty
 
-    def _soft(self, sampler: mi.Sampler, ray: mi.RayDifferential3f, moving: bool, gloss: bool) -> mi.Color3f:
+    def _soft(self, scene: mi.Scene, views: Views, samples: Samples, gloss: bool) -> mi.Color3f:
         """Return the soft light of one lobe by each sample."""
-        scene = self._scene_at(moving)
+        _, sampler, ray = views.samples(samples, centre=True)
         si = scene.ray_intersect(ray)
         bsdf = si.bsdf(ray)
         matte, coated, _ = _lobes(si, bsdf)
@@ -108,21 +116,22 @@ class SplitTracer(WavefrontTracer):
 
     def _radiance(
         self,
-        view: mi.UInt32,
-        sampler: mi.Sampler,
-        ray: mi.RayDifferential3f,
+        scene: mi.Scene,
+        views: Views,
+        samples: Samples,
         moving: bool,
-        maps: Sequence[tuple[float, SoftMap]],
+        objects: SoftMaps,
+        maps: Sequence[tuple[mi.Float, SoftMap]],
     ) -> mi.Color3f:
         """Return the radiance of each sample."""
-        scene = self._scene_at(moving)
+        view, sampler, ray = views.samples(samples)
         hit = scene.ray_intersect_preliminary(ray)
         si = hit.compute_surface_interaction(ray)
         bsdf = si.bsdf(ray)
         matte, coated, metal = _lobes(si, bsdf)
         light = si.emitter(scene).eval(si) + self._sampled_light(scene, si, bsdf, metal, sampler)
-        places = [self._maps.place(view, si, hit, share, known, moving, matte) for share, known in maps]
-        on_albedo, gloss, weight = self._maps.looked_up(view, places, matte)
+        places = [objects.place(view, si, hit, share, known, moving, matte) for share, known in maps]
+        on_albedo, gloss, weight = objects.looked_up(view, places, matte)
         known_here = matte & (weight > LEAST_WEIGHT)
         albedo = bsdf.eval_diffuse_reflectance(si, matte)
         light += dr.select(known_here, (albedo * on_albedo + dr.select(coated, gloss, 0)) / weight, 0)
@@ -164,6 +173,11 @@ class SplitTracer(WavefrontTracer):
                 kept = dr.select(metal, _balance(bs.pdf, scene.pdf_emitter_direction(si, ds, lamp & metal)), 0)
             light -= dr.select(lamp, emitter.eval(met, lamp) * (1 - kept), 0)
         return dr.select(active, weight * dr.minimum(light, self.most_light), 0)
+
+
+def _opaque(maps: Sequence[tuple[float, SoftMap]]) -> list[tuple[mi.Float, SoftMap]]:
+    """Return the maps with weights that are no literals of the program."""
+    return [(dr.opaque(mi.Float, weight), known) for weight, known in maps]
 
 
 def _launches(pixels: np.ndarray, spp: Counts, stream: Counts) -> Iterator[tuple[np.ndarray, Counts, Counts]]:

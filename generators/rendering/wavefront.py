@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -108,108 +109,72 @@ def _shuffle(i: mi.UInt32, n: mi.UInt32, salt: mi.UInt32) -> mi.UInt32:
     return (i + (salt >> 9)) & w
 
 
-class WavefrontTracer:
-    """Traces pixels of several views at once. Pixels are flat numbers: (view * height + row) * width + column."""
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The samples of a launch, N of K pixels. The lists of pixels end with a zero: one number alone is a scalar."""
 
-    def __init__(
-        self, scene: MitsubaScene, cameras: Sequence[Camera], seed: int, max_depth: int, psf_px: float = 0.0
-    ) -> None:
-        self._footprint = mi.Float(aligned(footprint_quantiles(psf_px).astype(np.float32))) if psf_px else None
-        self._scene, self._seed = scene, seed
-        self._width, self._height = cameras[0].width, cameras[0].height
-        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
-        rows = []
-        for c in cameras:
-            to_world = c.R.T @ np.linalg.inv(c.K)  # pixel coordinates -> world direction
-            rows.append([*to_world.ravel(), *c.center])
-        self._cameras = mi.Float(aligned(np.array(rows, np.float32).ravel()))  # [C, 12]
+    number: mi.UInt32  # [N] place of its pixel in the lists
+    pixels: mi.UInt32  # [K + 1] flat
+    first: mi.UInt32  # [K + 1] sample
+    bits: mi.UInt32  # [K + 1] of the number of samples
+    salts: mi.UInt32  # [K + 1]
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What makes the rays of all views; a tree of arrays, for `dr.freeze`."""
+
+    width: int
+    height: int
+    keys: mi.UInt32  # [C + 1] numbers of the cameras, and 0: one number alone would be another kernel's
+    cameras: mi.Float  # [C * 12] matrices from pixel coordinates to directions, and centres
+    lenses: mi.Float | None  # [C * 9] fx, fy, cx, cy, and the distortion
+    footprint: mi.Float | None  # quantiles of a blurred pixel
+
+    @staticmethod
+    def of(cameras: Sequence[Camera], psf_px: float) -> Views:
+        """Return those of cameras of one resolution."""
         lenses = [[c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)] for c in cameras]
         has_lens = any(c.distortion for c in cameras)
-        self._lenses = mi.Float(aligned(np.array(lenses, np.float32).ravel())) if has_lens else None
-        by_id = {shape.id(): shape for shape in scene.movers.shapes()}
-        self._movers = [mi.ShapePtr(by_id[name]) for name in scene.mover_ids]
-        keys = [zlib.crc32(c.id.encode()) for c in cameras]
-        self._keys = mi.UInt32(aligned(np.array([*keys, 0], np.uint32)))  # one number alone would be another kernel's
+        rows = [[*(c.R.T @ np.linalg.inv(c.K)).ravel(), *c.center] for c in cameras]
+        return Views(
+            cameras[0].width,
+            cameras[0].height,
+            mi.UInt32(aligned(np.array([*(zlib.crc32(c.id.encode()) for c in cameras), 0], np.uint32))),
+            mi.Float(aligned(np.array(rows, np.float32).ravel())),
+            mi.Float(aligned(np.array(lenses, np.float32).ravel())) if has_lens else None,
+            mi.Float(aligned(footprint_quantiles(psf_px).astype(np.float32))) if psf_px else None,
+        )
 
-    def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
-        """Return the linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples (a power of two).
-
-        A pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone.
-        """
-        per_launch = max(LANES // spp, 1)
-        parts = [
-            self._launch(pixels[k : k + per_launch], spp, stream, moving) for k in range(0, len(pixels), per_launch)
-        ]
-        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
-
-    def _launch(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
-        _, sampler, ray = self._camera_samples(pixels, spp, stream)
-        scene = self._scene.full if moving else self._scene.empty
-        radiance, _, _ = self._integrator.sample(scene, sampler, ray)
-        return self._means(radiance, spp)
-
-    def _camera_samples(
-        self, pixels: np.ndarray, spp: Counts, stream: Counts, centre: bool = False
-    ) -> tuple[mi.UInt32, PixelSampler, mi.RayDifferential3f]:
+    def samples(self, launch: Samples, centre: bool = False) -> tuple[mi.UInt32, PixelSampler, mi.RayDifferential3f]:
         """Return view, sampler and ray of each sample; `centre`: all rays through the middle of their pixel."""
-        listed = mi.UInt32(aligned(pixels.astype(np.uint32)))
-        number, index, bits = self._lanes(len(pixels), spp)
-        pixel = dr.gather(mi.UInt32, listed, number)
-        area = self._width * self._height
+        pixel, first, bits, salt = (
+            dr.gather(mi.UInt32, a, launch.number) for a in (launch.pixels, launch.first, launch.bits, launch.salts)
+        )
+        area = self.width * self.height
         view = pixel // area
         inside = pixel - view * area
-        row = inside // self._width
-        column = inside - row * self._width
-        salt = self._salt(stream, spp, number)
-        key = _hash(_hash(inside ^ _hash(dr.gather(mi.UInt32, self._keys, view))) + salt)
-        sampler = PixelSampler(key, index, bits)
+        row = inside // self.width
+        column = inside - row * self.width
+        key = _hash(_hash(inside ^ _hash(dr.gather(mi.UInt32, self.keys, view))) + salt)
+        sampler = PixelSampler(key, dr.arange(mi.UInt32, dr.width(launch.number)) - first, bits)
         offset = mi.Point2f(0.5) if centre else sampler.next_2d()
-        if self._footprint is not None and not centre:
+        if self.footprint is not None and not centre:
             offset = mi.Point2f(self._blurred(offset.x), self._blurred(offset.y))
         return view, sampler, self._ray(view, mi.Float(column) + offset.x, mi.Float(row) + offset.y)
-
-    def _lanes(self, count: int, spp: Counts) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Return of each sample its pixel's position in the list, its number there, and the bits of that number."""
-        if isinstance(spp, int):
-            bits = dr.opaque(mi.UInt32, spp.bit_length() - 1)
-            lane = dr.arange(mi.UInt32, count * spp)
-            number = lane >> bits
-            return number, lane - (number << bits), bits
-        number = mi.UInt32(aligned(np.repeat(np.arange(count, dtype=np.uint32), spp)))
-        first = mi.UInt32(aligned((np.cumsum(spp) - spp).astype(np.uint32)))
-        bits = mi.UInt32(aligned(np.log2(spp).astype(np.uint32)))
-        first, bits = (dr.gather(mi.UInt32, a, number) for a in (first, bits))
-        return number, dr.arange(mi.UInt32, dr.width(number)) - first, bits
-
-    def _salt(self, stream: Counts, spp: Counts, number: mi.UInt32) -> mi.UInt32:
-        """Return the salt of each sample; `number` is the position of its pixel in the list."""
-        if isinstance(stream, int) and isinstance(spp, int):
-            return dr.opaque(mi.UInt32, (self._seed * 0x2545F491 + stream * 0x9E3779B1 + spp) & 0xFFFFFFFF)
-        streams, counts = (np.asarray(a).astype(np.uint64) for a in (stream, spp))
-        salts = (np.uint64(self._seed * 0x2545F491 & 0xFFFFFFFF) + streams * 0x9E3779B1 + counts) & 0xFFFFFFFF
-        return dr.gather(mi.UInt32, mi.UInt32(aligned(salts.astype(np.uint32))), number)
-
-    def _means(self, values: mi.Color3f, spp: Counts) -> np.ndarray:
-        """Return the means [K, 3] float32 of each pixel's samples."""
-        dr.eval(values)  # the path kernel writes one colour per sample; the reductions below read it
-        if not isinstance(spp, int):
-            first = np.cumsum(spp) - spp
-            sums = np.stack([np.add.reduceat(np.array(c, np.float32), first) for c in values], 1)
-            return np.asarray(sums / spp[:, None].astype(np.float32))
-        return np.stack([np.array(dr.block_sum(c, spp), np.float32) for c in values], 1) / np.float32(spp)
 
     def _blurred(self, u: mi.Float) -> mi.Float:
         """Return the place in a blurred pixel, px from its left or upper edge, of numbers in [0, 1): one each way."""
         at = u * _QUANTILES
         first = mi.UInt32(at)
-        low, high = (dr.gather(mi.Float, self._footprint, first + k) for k in (0, 1))
+        low, high = (dr.gather(mi.Float, self.footprint, first + k) for k in (0, 1))
         return 0.5 + low + (high - low) * (at - mi.Float(first))
 
     def _ray(self, view: mi.UInt32, u: mi.Float, v: mi.Float) -> mi.RayDifferential3f:
         def number(k: int) -> mi.Float:
-            return dr.gather(mi.Float, self._cameras, view * 12 + k)
+            return dr.gather(mi.Float, self.cameras, view * 12 + k)
 
-        if self._lenses is not None:
+        if self.lenses is not None:
             u, v = self._straightened(view, u, v)
         d = [number(3 * k) * u + number(3 * k + 1) * v + number(3 * k + 2) for k in range(3)]
         ray = dr.zeros(mi.RayDifferential3f, dr.width(view))
@@ -220,7 +185,7 @@ class WavefrontTracer:
 
     def _straightened(self, view: mi.UInt32, u: mi.Float, v: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Return the pinhole's pixel coordinates of the lens's, by Newton's method as in `lens.undistort`."""
-        fx, fy, cx, cy, k1, k2, p1, p2, k3 = (dr.gather(mi.Float, self._lenses, view * 9 + k) for k in range(9))
+        fx, fy, cx, cy, k1, k2, p1, p2, k3 = (dr.gather(mi.Float, self.lenses, view * 9 + k) for k in range(9))
         wanted_x, wanted_y = (u - cx) / fx, (v - cy) / fy
         x, y = wanted_x, wanted_y
         for _ in range(_LENS_STEPS):
@@ -235,6 +200,62 @@ class WavefrontTracer:
             determinant = xx * yy - xy * xy
             x, y = x + (yy * a - xy * b) / determinant, y + (xx * b - xy * a) / determinant
         return x * fx + cx, y * fy + cy
+
+
+class WavefrontTracer:
+    """Traces pixels of several views at once. Pixels are flat numbers: (view * height + row) * width + column."""
+
+    def __init__(
+        self, scene: MitsubaScene, cameras: Sequence[Camera], seed: int, max_depth: int, psf_px: float = 0.0
+    ) -> None:
+        self._scene, self._seed = scene, seed
+        self._views = Views.of(cameras, psf_px)
+        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+        by_id = {shape.id(): shape for shape in scene.movers.shapes()}
+        self._movers = [mi.ShapePtr(by_id[name]) for name in scene.mover_ids]
+
+    def trace(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
+        """Return the linear RGB radiance [K, 3] float32 of flat `pixels` [K], mean of `spp` samples (a power of two).
+
+        A pixel's samples are a function of (seed, camera id, row, column, spp, stream) alone.
+        """
+        per_launch = max(LANES // spp, 1)
+        parts = [
+            self._launch(pixels[k : k + per_launch], spp, stream, moving) for k in range(0, len(pixels), per_launch)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+
+    def _launch(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
+        _, sampler, ray = self._views.samples(self._lanes(pixels, spp, stream))
+        scene = self._scene.full if moving else self._scene.empty
+        radiance, _, _ = self._integrator.sample(scene, sampler, ray)
+        return self._means(radiance, spp)
+
+    def _lanes(self, pixels: np.ndarray, spp: Counts, stream: Counts) -> Samples:
+        """Return the samples of a launch."""
+        counts = np.full(len(pixels), spp) if isinstance(spp, int) else spp
+        streams = np.full(len(pixels), stream) if isinstance(stream, int) else stream
+        salts = (
+            np.uint64(self._seed * 0x2545F491 & 0xFFFFFFFF)
+            + streams.astype(np.uint64) * 0x9E3779B1
+            + counts.astype(np.uint64)
+        )
+        return Samples(
+            mi.UInt32(aligned(np.repeat(np.arange(len(pixels), dtype=np.uint32), counts))),
+            *(
+                mi.UInt32(aligned(np.append(a, 0).astype(np.uint32)))
+                for a in (pixels, np.cumsum(counts) - counts, np.log2(counts), salts & 0xFFFFFFFF)
+            ),
+        )
+
+    def _means(self, values: mi.Color3f, spp: Counts) -> np.ndarray:
+        """Return the means [K, 3] float32 of each pixel's samples."""
+        dr.eval(values)  # the path kernel writes one colour per sample; the reductions below read it
+        if not isinstance(spp, int):
+            first = np.cumsum(spp) - spp
+            sums = np.stack([np.add.reduceat(np.array(c, np.float32), first) for c in values], 1)
+            return np.asarray(sums / spp[:, None].astype(np.float32))
+        return np.stack([np.array(dr.block_sum(c, spp), np.float32) for c in values], 1) / np.float32(spp)
 
     def prepare(self, origins: np.ndarray, directions: np.ndarray) -> mi.Ray3f:
         """Return rays [N, 3] with unit directions, prepared for repeated casts."""

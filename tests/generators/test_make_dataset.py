@@ -139,7 +139,7 @@ def test_what_changes_the_radiance_is_rendered_anew_and_a_killed_run_goes_on_wit
     fake, monkeypatch, tmp_path
 ):
     rendered, simulate = count_keys(monkeypatch), streams.write_camera
-    jobs = [SceneSettings(profile="tiny", physics=physics_of(o)).job("car") for o in ("", "psf-px=0.5", "light=2")]
+    jobs = [SceneSettings(profile="tiny", physics=physics_of(o)).job("car") for o in ("psf-px=0.5", "", "light=2")]
 
     def cut(scene, job, *others):
         if job.physics.light == 2:

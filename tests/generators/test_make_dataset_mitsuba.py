@@ -19,9 +19,9 @@ from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 
 
-def start(out, *more):
+def start(out, *more, worlds=("car",)):
     code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["make-dataset", "car", "--profile", "tiny", "--out", str(out), *more]
+    arguments = ["make-dataset", *worlds, "--profile", "tiny", "--out", str(out), *more]
     return subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
@@ -91,3 +91,14 @@ def test_a_scene_killed_on_two_workers_is_finished_by_a_cluster(whole, tmp_path)
     assert process.returncode == 0, output.decode()
     found = files_in(tmp_path / "car-0-tiny")
     assert found["manifest.json"] == whole["manifest.json"] and found == whole
+
+
+@pytest.mark.slow
+def test_scenes_made_side_by_side_have_the_bytes_of_one_made_alone(whole, tmp_path):
+    output, _ = (process := start(tmp_path, "--workers", "2", worlds=("turntable", "car"))).communicate(timeout=300)
+    assert process.returncode == 0, output.decode()
+    assert files_in(tmp_path / "car-0-tiny") == whole
+    assert open_scene(tmp_path / "turntable-0-tiny").id == "turntable-0-tiny"
+    assert json.loads((tmp_path / "car-0-tiny.report.json").read_text())["plan"]["keys"] == 5
+    assert b"car-0-tiny (2 of 2): key frames" in output
+    assert not (tmp_path / ".work").exists()

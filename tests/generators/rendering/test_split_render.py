@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -139,6 +140,39 @@ def test_kernels_serve_all_lists_of_pixels_and_numbers_of_samples(r):
             rendered(start, count, spp)
         launched = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
     assert launched and all(kernel["cache_hit"] for kernel in launched)
+
+
+@pytest.mark.parametrize("world", ["turntable", "bird", "bricks"])  # rigid; smooth and bending; flat and in pieces
+def test_recorded_launches_are_those_that_are_traced_anew(world):
+    """What a record keeps of the scene, such as the addresses of vertices, has to follow the motion."""
+    import drjit as dr
+
+    if load_mitsuba().variant() != "llvm_ad_rgb":
+        pytest.skip("other variants record nothing")
+    lens = [replace(c, distortion=(-0.1, 0.01, 0.0, 0.0, 0.0)) for c in cameras(built(world), WIDTH, HEIGHT, (1, 4))]
+    own = SplitRenderer(built(world), lens, seed=0, spp=SPP, background_spp=2 * SPP, soft=SOFT, psf_px=0.4)
+
+    def launched(t_s: float) -> list[np.ndarray]:
+        where, maps = np.flatnonzero(own.traced(t_s)), own._maps_at(t_s)
+        counts = 2 ** (where % 4 + 1)
+        own._scene.set_time(t_s)
+        return [
+            own._tracer.split(where, counts, where, True, maps),
+            own._tracer.spread(where, where, True, maps),
+            own._tracer.soft(where, counts, where, True, gloss=False),
+            own._tracer.soft(where, 4, where, True, gloss=True),
+            own._tracer.split(where, 8, 3, False, maps[:1]),
+        ]
+
+    times = (0.004, 0.0113, 0.0126, 0.004)
+    recorded = [launched(t_s) for t_s in times]
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        traced = [launched(t_s) for t_s in times]
+    for found, expected in zip(recorded, traced, strict=True):
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(recorded[0][0], recorded[1][0])
+    assert own._tracer._radiance_of.n_recordings <= 3 and own._tracer._soft_of.n_recordings <= 4
 
 
 @one_world
