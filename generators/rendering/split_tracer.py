@@ -15,7 +15,9 @@ compare both.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -48,8 +50,9 @@ class SplitTracer(WavefrontTracer):
         self._maps = SoftMaps.of(scene, cameras)
         self.most_light = _MOST_LIGHT
         # Tracing the program of a launch takes as long as a third of a key's samples, so it is recorded once.
-        recorded = dr.freeze if scene.keeps_buffers else lambda function: function
-        self._radiance_of, self._soft_of = recorded(self._radiance), recorded(self._soft)
+        self._radiance_of, self._soft_of = self._radiance, self._soft
+        if scene.keeps_buffers:
+            self._radiance_of, self._soft_of = _Recorded(self._radiance), _Recorded(self._soft)
 
     # ------------------------------------------------------------ the parts
 
@@ -173,6 +176,24 @@ class SplitTracer(WavefrontTracer):
                 kept = dr.select(metal, _balance(bs.pdf, scene.pdf_emitter_direction(si, ds, lamp & metal)), 0)
             light -= dr.select(lamp, emitter.eval(met, lamp) * (1 - kept), 0)
         return dr.select(active, weight * dr.minimum(light, self.most_light), 0)
+
+
+class _Recorded:
+    """A function whose program is traced once for arguments of a kind."""
+
+    def __init__(self, function: Callable[..., mi.Color3f]) -> None:
+        self.frozen = dr.freeze(function)
+
+    def __call__(self, *arguments: Any) -> mi.Color3f:
+        # The collector may free an array of NumPy's memory, such as an old renderer's, and Dr.Jit ends the process
+        # where that happens in a recording.
+        was_on = gc.isenabled()
+        gc.disable()
+        try:
+            return self.frozen(*arguments)
+        finally:
+            if was_on:
+                gc.enable()
 
 
 def _opaque(maps: Sequence[tuple[float, SoftMap]]) -> list[tuple[mi.Float, SoftMap]]:

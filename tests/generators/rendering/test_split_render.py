@@ -13,6 +13,7 @@ from built_worlds import built
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.profiles import SPLIT_PROFILES
 from spike4dgs.generators.rendering.image_motion import KeyPlan
+from spike4dgs.generators.rendering.mitsuba_scene import aligned
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.generators.rendering.split_render import SplitRenderer
 from spike4dgs.generators.rig import cameras
@@ -172,7 +173,39 @@ def test_recorded_launches_are_those_that_are_traced_anew(world):
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_array_equal(a, b)
     assert not np.array_equal(recorded[0][0], recorded[1][0])
-    assert own._tracer._radiance_of.n_recordings <= 3 and own._tracer._soft_of.n_recordings <= 4
+    assert own._tracer._radiance_of.frozen.n_recordings <= 3 and own._tracer._soft_of.frozen.n_recordings <= 4
+
+
+@one_world
+def test_garbage_is_collected_before_or_after_a_recording(r, monkeypatch):
+    """An array of NumPy's memory that is freed in a recording ends the process: an old renderer's, at any time."""
+    import mitsuba as mi
+
+    from spike4dgs.generators.rendering.wavefront import Views  # it needs compiled kernels
+
+    class Old:
+        def __init__(self) -> None:
+            self.itself, self.array = self, mi.Float(aligned(np.ones(16, np.float32)))
+
+    samples, usual, old = Views.samples, gc.get_threshold(), list[Old]()
+
+    def littering(*arguments, **others):
+        old.clear()
+        gc.set_threshold(1)
+        assert [[] for _ in range(100)], "containers, which the collector counts"
+        return samples(*arguments, **others)
+
+    own, where = renderer(r.world), np.arange(40)
+    maps = own._maps_at(T_S)
+    monkeypatch.setattr(Views, "samples", littering)
+    gc.collect()
+    gc.set_threshold(100_000)
+    old.append(Old())
+    try:
+        own._tracer.split(where, 4, where, True, maps)
+    finally:
+        gc.set_threshold(*usual)
+    assert gc.isenabled()
 
 
 @one_world
