@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import locked, read_json, write_json, write_text
+from spike4dgs.benchmark.files import locked, read_json, remove_parts, write_json, write_text
 from spike4dgs.benchmark.method import Method, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
@@ -38,6 +38,7 @@ def predict_all(scenes: Sequence[Scene], methods: Sequence[Method], settings: Se
         locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
         RunDisplay(make_console(), len(scenes) * len(methods), [m.name for m in methods for _ in scenes]) as display,
     ):
+        remove_parts(settings.out)
         for method, scene in product(methods, scenes):
             job = Job(method, scene, settings.seed, settings.device, settings.budget)
             files = JobFiles(job, settings.out, apart=settings.apart)

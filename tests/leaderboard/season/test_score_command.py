@@ -79,6 +79,14 @@ def test_one_participants_mistake_does_not_stop_another(made: Made, capsys: pyte
     assert [r.name for r in read_results(made.seasons, made.season)] == ["rough"]
 
 
+def test_what_a_killed_fit_left_half_written_goes_and_predictions_stay(made: Made) -> None:
+    folder = made.root / "runs/predictions/counts"
+    before, left = files_in(folder), folder / "car-9003-tiny/.prediction.4711.part.json"
+    left.write_text("{")
+    made.predict(CountMethod("counts"))
+    assert files_in(folder) == before
+
+
 def test_a_scene_without_predictions_is_not_left_out(made: Made) -> None:
     (made.root / "runs/predictions/counts/car-9003-tiny").rename(made.root / "elsewhere")
     assert made.score("counts", "rough") == 0
