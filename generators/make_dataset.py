@@ -168,19 +168,20 @@ def make_dataset(
             if job.physics.moves_array and world_of(job).flash:
                 fix = "leave out --array-motion and --array-rotation"
                 raise problem("an array that moves", "a world in steady light", job.world, fix)
-    plans = _planned(jobs, todo, audit)
+    plans = _planned(jobs, todo)
     apart = len(plans) // workers * workers if workers > 1 and scheduler is None else 0
     with executor(workers, scheduler) as run:
-        for _ in run(_MakeScenes(out), plans[:apart]):
-            pass
-        making = partial(_make, out=out, run=run, in_process=workers == 1 and scheduler is None, console=console)
+        if apart:
+            for _ in run(_MakeScenes(out, audit), plans[:apart]):
+                pass
+        making = partial(_make, run=run, in_process=workers == 1 and scheduler is None, console=console)
         for plan in plans[apart:]:
             for one in plan:
-                making(one)
+                making(one, out, with_audit=audit)
 
         def make(job: Job, folder: Path) -> None:
             if not _is_done(job, folder, False):
-                making(_Planned(job, False, ", other noise"), out=folder)
+                making(_Planned(job, ", other noise"), folder, with_audit=False)
 
         return check_scenes(jobs, out, references, make) if check else 0
 
@@ -189,26 +190,23 @@ class _Planned(NamedTuple):
     """A scene to make."""
 
     job: Job
-    audit: bool
-    which: str  # of all, as its title says
+    which: str = ""  # of all, as its title says
     has_others: bool = False  # scenes of its rendering
     is_last: bool = True  # of them
 
 
-def _planned(jobs: Sequence[Job], todo: Sequence[Job], audit: bool) -> list[list[_Planned]]:
+def _planned(jobs: Sequence[Job], todo: Sequence[Job]) -> list[list[_Planned]]:
     """Return the scenes that are to be made, those of one rendering together."""
-    renderings = Counter(map(rendering_of, jobs))
-    plans: dict[Job, list[_Planned]] = {}
+    renderings, number = Counter(map(rendering_of, jobs)), count(1)
+    groups: dict[Job, list[Job]] = {}
     for job in todo:
-        plans.setdefault(rendering_of(job), []).append(_Planned(job, audit, "", renderings[rendering_of(job)] > 1))
-    number = count(1)
-    return [
-        [
-            one._replace(which=f" ({next(number)} of {len(todo)})" if len(todo) > 1 else "", is_last=one is plan[-1])
-            for one in plan
-        ]
-        for plan in plans.values()
-    ]
+        groups.setdefault(rendering_of(job), []).append(job)
+
+    def planned(job: Job, rendering: Job) -> _Planned:
+        which = f" ({next(number)} of {len(todo)})" if len(todo) > 1 else ""
+        return _Planned(job, which, renderings[rendering] > 1, job is groups[rendering][-1])
+
+    return [[planned(job, rendering) for job in group] for rendering, group in groups.items()]
 
 
 @dataclass(frozen=True)
@@ -216,18 +214,19 @@ class _MakeScenes:
     """Makes whole scenes one after another, on the core of a worker process: no worker waits for another."""
 
     out: Path
+    audit: bool
 
     def __call__(self, plan: Sequence[_Planned]) -> None:
         console = Console(highlight=False, soft_wrap=True, force_terminal=False, force_jupyter=False)
         for one in plan:
-            _make(one, out=self.out, run=here, in_process=True, console=console)
+            _make(one, self.out, run=here, in_process=True, console=console, with_audit=self.audit)
 
 
-def _make(one: _Planned, *, out: Path, run: Run, in_process: bool, console: Any) -> None:
+def _make(one: _Planned, out: Path, *, run: Run, in_process: bool, console: Any, with_audit: bool) -> None:
     """Make one scene and its report."""
     start, job = time.perf_counter(), one.job
     with _stages(console, job.id + one.which) as watch:
-        maker = (SharingMaker if one.has_others else Maker)(job, out, watch, run, one.audit, in_process)
+        maker = (SharingMaker if one.has_others else Maker)(job, out, watch, run, with_audit, in_process)
         folder = maker.make()
     if isinstance(maker, SharingMaker) and one.is_last:
         maker.forget()

@@ -46,10 +46,14 @@ def places_in(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
     NaN where a point is behind a camera. Beyond the fold of a lens places are wrong: no like surface is seen there.
     """
-    rows = [[*c.R.ravel(), *c.t, c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)] for c in cameras]
     out = np.full((len(points), len(cameras), 2), np.nan, np.float32)
-    in_threads(_places, len(points), points.astype(np.float64), np.array(rows), out, small=len(points) < 1000)
+    in_threads(_places, len(points), points.astype(np.float64), camera_rows(cameras), out, small=len(points) < 1000)
     return out
+
+
+def camera_rows(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return [C, 21] float64: rotation and translation into each camera, fx, fy, cx, cy, and its lens."""
+    return np.array([[*c.R.ravel(), *c.t, c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)] for c in cameras])
 
 
 def coverage(pixels: np.ndarray, paths: np.ndarray, surfaces: Surfaces, places: np.ndarray) -> np.ndarray:

@@ -74,8 +74,9 @@ class MitsubaScene:
         solid = {k: part for k, part in world.static.items() if k not in panes}
         self.opaque = mi.load_dict({"type": "scene", **lamps, **_shapes("solid", solid)}) if panes else self.empty
         self._parameters = [mi.traverse(scene) for scene in (self.full, self.movers)]
-        self._buffers: list[dict[str, Any]] = [{} for _ in self._parameters]  # of each: what Mitsuba reads, as NumPy's
-        self.keeps_buffers = str(mi.variant()).startswith("llvm")  # Mitsuba reads NumPy's memory
+        # of both scenes: a mesh's buffer as NumPy's array and as Mitsuba's, which are the same memory
+        self._buffers: list[dict[str, tuple[np.ndarray, Any]]] = [{} for _ in self._parameters]
+        self._is_scalar, self.keeps_buffers = (str(mi.variant()).startswith(kind) for kind in ("scalar", "llvm"))
         self._time_s: float | None = None
         self.set_time(0.0)
 
@@ -120,30 +121,27 @@ class MitsubaScene:
             positions[f"moving_{name}.vertex_positions"], own = batch.at(t_s, turns)
             if own is not None:
                 normals[f"moving_{name}.vertex_normals"] = own
-        if not self.keeps_buffers:
-            self._replace(positions, normals)
-        else:
-            self._write(positions | normals)
-            if computed := [f"moving_{name}.vertex_normals" for name, b in self._batches.items() if b.lacks_normals]:
-                self._write({name: np.array(self._parameters[0][name]) for name in computed})
+        # the scalar variants compute their own normals whenever positions are set, so ours have to come after that
+        for values in [positions, normals] if self._is_scalar else [positions | normals]:
+            self._set(values)
+        if self.keeps_buffers:  # normals that Mitsuba computes have a new buffer now
+            lacking = [f"moving_{name}.vertex_normals" for name, batch in self._batches.items() if batch.lacks_normals]
+            if lacking:
+                self._set({name: np.array(self._parameters[0][name]) for name in lacking})
         self._time_s = t_s
 
-    def _replace(self, positions: Mapping[str, np.ndarray], normals: Mapping[str, np.ndarray]) -> None:
-        """Give the meshes new buffers; normals last, as the scalar variants compute theirs when positions are set."""
-        for parameters in self._parameters:
-            for values in (positions, normals):
-                for name, array in values.items():
-                    parameters[name] = aligned(array)
-                parameters.update()
-
-    def _write(self, values: Mapping[str, np.ndarray]) -> None:
-        """Write into the meshes' buffers, which stay where they are: what `dr.freeze` recorded has their addresses."""
+    def _set(self, values: Mapping[str, np.ndarray]) -> None:
+        """Give the meshes of `full` and `movers` other values; with `keeps_buffers` in the same memory."""
         import drjit as dr
 
         mi = load_mitsuba()
-        dr.sync_thread()  # a kernel may still read them
+        if self.keeps_buffers:
+            dr.sync_thread()  # a kernel may still read it
         for parameters, buffers in zip(self._parameters, self._buffers, strict=True):
             for name, array in values.items():
+                if not self.keeps_buffers:
+                    parameters[name] = aligned(array)
+                    continue
                 if name not in buffers:
                     buffers[name] = (own := aligned(array)), mi.Float(own)
                 buffers[name][0][...] = array

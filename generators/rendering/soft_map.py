@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.generators.rendering.like_surfaces import LIKE_COSINE, LIKE_PX
+from spike4dgs.generators.rendering.like_surfaces import LIKE_COSINE, LIKE_PX, camera_rows
 from spike4dgs.generators.rendering.mitsuba_scene import MitsubaScene, aligned
 
 LEAST_WEIGHT = 0.02  # of like surfaces around a sample, of at most 1; below it a sample traces its path
@@ -63,7 +63,7 @@ class SoftMaps:
     height: int
     moving: list[tuple[mi.ShapePtr, int]]  # the surfaces, and the first of `faces` of each
     faces: mi.UInt32  # [F * 4] vertices of a face, and a number that nobody reads
-    cameras: mi.Float  # [C * 21]
+    cameras: mi.Float  # [C * 21] `camera_rows`
     has_lens: bool
 
     @staticmethod
@@ -72,13 +72,12 @@ class SoftMaps:
         by_id = {shape.id(): shape for shape in scene.full.shapes()}
         faces = np.zeros((len(scene.moving_faces), 4), np.uint32)
         faces[:, :3] = scene.moving_faces
-        rows = [[*c.R.ravel(), *c.t, c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)] for c in cameras]
         return SoftMaps(
             cameras[0].width,
             cameras[0].height,
             [(mi.ShapePtr(by_id[name]), first) for name, first in scene.first_faces().items()],
             mi.UInt32(aligned(faces.ravel())),
-            mi.Float(aligned(np.array(rows, np.float32).ravel())),
+            mi.Float(aligned(camera_rows(cameras).astype(np.float32).ravel())),
             any(c.distortion for c in cameras),
         )
 

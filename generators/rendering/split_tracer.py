@@ -103,9 +103,6 @@ class SplitTracer(WavefrontTracer):
         """Return the inputs of a launch."""
         return self._scene_at(moving), self._views, self._lanes(pixels, spp, stream)
 
-    def _scene_at(self, moving: bool) -> mi.Scene:
-        return self._scene.full if moving else self._scene.empty
-
     def _soft(self, scene: mi.Scene, views: Views, samples: Samples, gloss: bool) -> mi.Color3f:
         """Return the soft light of one lobe by each sample."""
         _, sampler, ray = views.samples(samples, centre=True)

@@ -227,14 +227,15 @@ class WavefrontTracer:
 
     def _launch(self, pixels: np.ndarray, spp: int, stream: int, moving: bool) -> np.ndarray:
         _, sampler, ray = self._views.samples(self._lanes(pixels, spp, stream))
-        scene = self._scene.full if moving else self._scene.empty
-        radiance, _, _ = self._integrator.sample(scene, sampler, ray)
+        radiance, _, _ = self._integrator.sample(self._scene_at(moving), sampler, ray)
         return self._means(radiance, spp)
+
+    def _scene_at(self, moving: bool) -> mi.Scene:
+        return self._scene.full if moving else self._scene.empty
 
     def _lanes(self, pixels: np.ndarray, spp: Counts, stream: Counts) -> Samples:
         """Return the samples of a launch."""
-        counts = np.full(len(pixels), spp) if isinstance(spp, int) else spp
-        streams = np.full(len(pixels), stream) if isinstance(stream, int) else stream
+        counts, streams = (np.broadcast_to(a, pixels.shape) for a in (spp, stream))
         salts = (
             np.uint64(self._seed * 0x2545F491 & 0xFFFFFFFF)
             + streams.astype(np.uint64) * 0x9E3779B1

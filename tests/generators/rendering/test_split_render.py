@@ -153,10 +153,8 @@ def test_recorded_launches_are_those_that_are_traced_anew(world):
     lens = [replace(c, distortion=(-0.1, 0.01, 0.0, 0.0, 0.0)) for c in cameras(built(world), WIDTH, HEIGHT, (1, 4))]
     own = SplitRenderer(built(world), lens, seed=0, spp=SPP, background_spp=2 * SPP, soft=SOFT, psf_px=0.4)
 
-    def launched(t_s: float) -> list[np.ndarray]:
-        where, maps = np.flatnonzero(own.traced(t_s)), own._maps_at(t_s)
+    def launched(where: np.ndarray, maps: list) -> list[np.ndarray]:
         counts = 2 ** (where % 4 + 1)
-        own._scene.set_time(t_s)
         return [
             own._tracer.split(where, counts, where, True, maps),
             own._tracer.spread(where, where, True, maps),
@@ -165,14 +163,17 @@ def test_recorded_launches_are_those_that_are_traced_anew(world):
             own._tracer.split(where, 8, 3, False, maps[:1]),
         ]
 
-    times = (0.004, 0.0113, 0.0126, 0.004)
-    recorded = [launched(t_s) for t_s in times]
-    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
-        traced = [launched(t_s) for t_s in times]
-    for found, expected in zip(recorded, traced, strict=True):
-        for a, b in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(recorded[0][0], recorded[1][0])
+    first = []
+    for t_s in (0.004, 0.0113, 0.0126, 0.004):
+        inputs = np.flatnonzero(own.traced(t_s)), own._maps_at(t_s)
+        own._scene.set_time(t_s)  # once: normals that Mitsuba adds up in threads may differ in the last bit
+        recorded = launched(*inputs)
+        with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+            traced = launched(*inputs)
+        for found, expected in zip(recorded, traced, strict=True):
+            np.testing.assert_array_equal(found, expected)
+        first.append(recorded[0])
+    assert not np.array_equal(first[0], first[1])
     assert own._tracer._radiance_of.frozen.n_recordings <= 3 and own._tracer._soft_of.frozen.n_recordings <= 4
 
 
