@@ -49,7 +49,7 @@ class SplitTracer(WavefrontTracer):
         self._matte.type_mask, self._glossy.type_mask = mi.BSDFFlags.Diffuse, mi.BSDFFlags.Glossy
         self._maps = SoftMaps.of(scene, cameras)
         self.most_light = _MOST_LIGHT
-        # Tracing the program of a launch takes as long as a third of a key's samples, so it is recorded once.
+        # Tracing the program of a launch takes a third as long as its samples, so it is recorded once.
         self._radiance_of, self._soft_of = self._radiance, self._soft
         if scene.keeps_buffers:
             self._radiance_of, self._soft_of = _Recorded(self._radiance), _Recorded(self._soft)
