@@ -50,7 +50,8 @@ class SplitTracer(WavefrontTracer):
         self._maps = SoftMaps.of(scene, cameras)
         self.most_light = _MOST_LIGHT
         # Tracing the program of a launch takes a third as long as its samples, so it is recorded once.
-        self._radiance_of, self._soft_of = self._radiance, self._soft
+        self._radiance_of: Callable[..., mi.Color3f] = self._radiance
+        self._soft_of: Callable[..., mi.Color3f] = self._soft
         if scene.keeps_buffers:
             self._radiance_of, self._soft_of = _Recorded(self._radiance), _Recorded(self._soft)
 
