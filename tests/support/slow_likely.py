@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spike4dgs.benchmark.spikes.likely_spikes import CERTAIN, CHANGES, CONTEXT, NEAR_TICKS, TICK, TIE, UNKNOWN
 
@@ -23,7 +24,7 @@ def slow_likely(
         return None
     trains = [c for n in range(len(lost) + 1) for c in itertools.combinations(lost, n)]
     trains.sort(key=lambda train: sum(1 << lost.index(t) for t in train))
-    scores = np.array([[_log_likelihood(left, train, right, s) for s in CHANGES] for train in trains])
+    scores = np.array([_log_likelihoods(left, train, right) for train in trains])
     shares = np.exp(scores - scores.max()).sum(axis=1)
     shares /= shares.sum()
     best = trains[next(i for i, s in enumerate(shares) if s >= shares.max() * (1 - TIE))]
@@ -40,31 +41,36 @@ def _context(spikes: Sequence[int]) -> list[int]:
     ]
 
 
-def _log_likelihood(left: Sequence[int], train: Sequence[int], right: Sequence[int], change: float) -> float:
-    """Return the log likelihood of all ticks, but for a constant, whatever the first instant and interval are."""
+def _log_likelihoods(left: Sequence[int], train: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
+    """Return the log likelihood of all ticks for each of CHANGES, but for a constant.
+
+    It holds whatever the first instant and interval are.
+    """
+    change = np.array(CHANGES)[:, None]
     ticks = np.array([*left, *train, *right], float)
     steps, n = np.diff(ticks), len(ticks)
     widest = math.log(right[0] - left[-1])
     # The log intervals are `mean`, and `walk` times independent deviates: a first one, and one from each to the next.
-    walk = change * np.tril(np.ones((n - 1, n - 1)))
+    walk = change[..., None] * np.tril(np.ones((n - 1, n - 1)))
     known = len(left) > 1
-    walk[:, 0] = 0.0 if known else math.sqrt(UNKNOWN + change**2)
+    walk[..., 0] = 0.0 if known else np.sqrt(UNKNOWN + change**2)
     mean = np.zeros(n - 1) if known else np.full(n - 1, widest)
     gathered = np.tril(np.ones((n, n - 1)), -1) * steps  # instants from log intervals
     expected = gathered @ (1 - np.log(steps) + mean)
-    spread, noise = gathered @ walk, np.full(n, TICK)
+    spread, noise = gathered @ walk, np.full((len(change), n), TICK)
     seen, free = ticks, np.ones((n, 2 if known else 1))
     if known:
         free[:, 1] = gathered.sum(axis=1)
     if len(right) == 1:  # the interval after the last spike is about the widest
         seen, expected = np.append(seen, widest), np.append(expected, mean[-1])
-        spread = np.vstack([spread, walk[-1]])
-        noise = np.append(noise, UNKNOWN + change**2)
+        spread = np.concatenate([spread, walk[:, -1:]], axis=1)
+        noise = np.concatenate([noise, UNKNOWN + change**2], axis=1)
         free = np.vstack([free, [0.0, 1.0][: free.shape[1]]])
-    covariance = spread @ spread.T + np.diag(noise)
+    covariance = spread @ spread.transpose(0, 2, 1) + noise[..., None] * np.eye(len(seen))
     inverse = np.linalg.inv(covariance)
-    rest = seen - expected
+    rest = (seen - expected)[:, None]
     information = free.T @ inverse @ free
     rest = rest - free @ np.linalg.solve(information, free.T @ inverse @ rest)
+    squares = (rest.transpose(0, 2, 1) @ inverse @ rest)[:, 0, 0]
     logs = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
-    return float(-(rest @ inverse @ rest + logs + (len(seen) - free.shape[1]) * math.log(2 * math.pi)) / 2)
+    return np.asarray(-(squares + logs + (len(seen) - free.shape[1]) * math.log(2 * math.pi)) / 2)

@@ -38,7 +38,7 @@ def stream_of(spikes, gaps=(), bottom_up=True):
     for first, ticks in gaps:
         lost[first : first + ticks] = 0
     found = tuple(Gap("cam_00", first, ticks, "overflow") for first, ticks in gaps)
-    return SpikeStream(pack(lost, bottom_up), WIDTH, HEIGHT, 20000.0, bottom_up, gaps=found)
+    return SpikeStream(pack(lost, bottom_up), WIDTH, lost.shape[1], 20000.0, bottom_up, gaps=found)
 
 
 def steady(rates, n_ticks=TICKS, seed=0):
@@ -195,9 +195,9 @@ def twin(fired, lost):
     st.integers(0, 2**31),
 )
 def test_the_kernel_is_its_twin_whatever_is_lost(gaps, even, seed):
-    rng, lost = np.random.default_rng(seed), np.zeros(140, bool)
-    rates = rng.random((HEIGHT, WIDTH)) ** 2
-    spikes = (rng.random((140, HEIGHT, WIDTH)) < rates).astype(np.uint8)
+    rng, lost, size = np.random.default_rng(seed), np.zeros(140, bool), (3, WIDTH)
+    rates = rng.random(size) ** 2
+    spikes = (rng.random((140, *size)) < rates).astype(np.uint8)
     if even:
         spikes = steady(rates, 140, seed)
     spikes[:, 0, 0], spikes[:, 0, 1], spikes[:, 0, 2] = 0, 1, 0
@@ -207,10 +207,10 @@ def test_the_kernel_is_its_twin_whatever_is_lost(gaps, even, seed):
     spikes[lost] = 0
     expected = np.array([twin(s, lost) for s in spikes.reshape(140, -1).T]).transpose(1, 2, 0)
     stream = fill_gaps(stream_of(spikes, [(int(t), 1) for t in np.flatnonzero(lost)]))
-    sure = np.unpackbits(stream.certain, axis=1, count=WIDTH * HEIGHT, bitorder="little").reshape(-1, HEIGHT, WIDTH)
+    sure = np.unpackbits(stream.certain, axis=1, count=rates.size, bitorder="little").reshape(-1, *size)
     found = stream.window(0, 140).reshape(140, -1), sure[:, ::-1].reshape(len(sure), -1)
     wrong = (found[0] != expected[0]).any(axis=0) | (found[1] != expected[1][lost]).any(axis=0)
-    assert wrong.mean() <= 0.01, "what is as near may round to either side"
+    assert wrong.sum() <= 1, "of 63 pixels: what is as near may round to either side"
 
 
 def filled_ticks(spikes, lost):
