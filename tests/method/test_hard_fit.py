@@ -65,6 +65,7 @@ def holes(value: float) -> np.ndarray:
     return np.where(np.random.default_rng(1).random((HEIGHT, WIDTH)) < 0.2, value, 1.0)
 
 
+@cache
 def case(name: str) -> TrainingScene:
     empty = np.zeros((TICKS, HEIGHT, WIDTH), bool)
     if name == "all dark":
@@ -88,8 +89,9 @@ def case(name: str) -> TrainingScene:
     if name == "one tick":
         return with_streams(np.random.default_rng(0).random((1, HEIGHT, WIDTH)) < 0.5)
     if name == "100,000 ticks":
-        tile = np.random.default_rng(0).random((100, HEIGHT, WIDTH)) < 0.3
-        return with_streams(np.tile(tile, (1000, 1, 1)), None)
+        tile = stream(np.random.default_rng(0).random((100, HEIGHT, WIDTH)) < 0.3)
+        long, scene = replace(tile, packed=np.tile(tile.packed, (1000, 1))), usual()
+        return replace(scene, streams=(long,) * len(scene.streams), n_ticks=long.n_ticks)
     if name == "NaN gain":
         return calibrated(usual(), holes(np.nan), np.zeros((HEIGHT, WIDTH)))
     if name == "NaN dark rate":

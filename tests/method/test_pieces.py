@@ -39,9 +39,6 @@ def surfaces(scene: TrainingScene, seed: int) -> Start:
     return Start(scene.cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
 
 
-TRUE = Initialization(lambda request: surfaces(request.scene, request.seed))
-
-
 def paths(n_ticks: int) -> Paths:
     extent = Extent(torch.zeros(3), torch.ones(3), 1.0, n_ticks, 64, wanted_images(n_ticks, ImageSettings()))
     return Paths(extent, PathSettings(), seeded(0, 0))
@@ -187,15 +184,17 @@ def test_a_time_is_rendered_by_the_piece_that_it_lies_in(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_pieces_follow_what_one_path_through_a_long_clip_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    parts = Parts({"short": images}, {"true": TRUE}, MOTIONS, SUPERVISIONS)
-    steps = {"trainer.coarse_steps": 100, "trainer.piece_steps": 200, "images.time_spacing_ticks": 20}
+    world = replace(WORLD, width=48, height=30)
+    true = Initialization(lambda r: Start(r.scene.cameras, *world.surfaces(r.scene.cameras[::2], 0.01, r.seed)))
+    parts = Parts({"short": images}, {"true": true}, MOTIONS, SUPERVISIONS)
+    steps = {"trainer.coarse_steps": 60, "trainer.piece_steps": 120, "images.time_spacing_ticks": 20}
 
     def fitted(fine_steps: int) -> FittedModel:
         recipe = Recipe("test", "short", "true", "paths", "pixel", {**steps, "trainer.fine_steps": fine_steps})
-        return RecipeMethod(recipe, parts).fit(WORLD.training, FitRequest())  # type: ignore[return-value]
+        return RecipeMethod(recipe, parts).fit(world.training, FitRequest())  # type: ignore[return-value]
 
-    pieces = fitted(250)
+    pieces = fitted(150)
     monkeypatch.setattr(paths_module, "PIECE_TICKS", 10_000)
-    whole = fitted(650)
+    whole = fitted(390)
     assert (len(pieces.pieces), len(whole.pieces)) == (3, 1)
-    assert WORLD.psnr(pieces, moving=True) > WORLD.psnr(whole, moving=True) + 2
+    assert world.psnr(pieces, moving=True) > world.psnr(whole, moving=True) + 2

@@ -48,7 +48,7 @@ def fifty_steps(motion: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     scene = WORLD.training
     start = surfaces(scene, 0)
     extent = measure(start, scene)
-    first = from_points(start.points[::27], start.values[::27], opacity=0.5)
+    first = from_points(start.points[::54], start.values[::54], opacity=0.5)
     model = MOTIONS[motion](extent, MOTIONS[motion].defaults, seeded(0, -1))
     training_images = make_training_images(scene, start.cameras, images, ImageSettings(time_spacing_ticks=40), "cpu")
     gaussians = model.initialize(first, training_images)
