@@ -31,7 +31,7 @@ def compare(splats: Splats, v: Views, **options: bool) -> None:
 @pytest.mark.parametrize("scene", [scene for scene in HARD if scene is not far_origin])  # float64 alone resolves that
 def test_hard_scenes_in_float32(scene: Callable[[], tuple[Splats, Views]]) -> None:
     splats, v = scene()
-    compare(Splats(*(t.float() for t in splats.tensors)), v)
+    compare(Splats(*(t[:200].float() for t in splats.tensors)), v)
 
 
 @pytest.mark.parametrize(("channels", "depth"), [(1, False), (1, True), (2, False), (3, True), (4, False), (9, True)])

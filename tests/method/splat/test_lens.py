@@ -29,7 +29,7 @@ every_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 @pytest.mark.parametrize("scene", [scene for scene in HARD if scene is not far_origin])
 def test_hard_scenes(scene: Callable[[], tuple[Splats, Views]], lens: tuple[float, ...]) -> None:
     splats, v = scene()
-    splat_parity.compare(Splats(*(t.float() for t in splats.tensors)), through(v, lens), "cpu")
+    splat_parity.compare(Splats(*(t[:200].float() for t in splats.tensors)), through(v, lens), "cpu")
 
 
 @settings(max_examples=15, deadline=None)
