@@ -221,19 +221,21 @@ def test_a_blurred_pixels_footprint_is_a_box_and_a_gaussian(sigma):
 
 
 def test_a_blur_is_that_of_the_radiance_and_keeps_its_sum():
-    """Against a rendering with eight times the pixels, filtered by SciPy."""
+    """Against a rendering with four times the pixels along each side, filtered by SciPy."""
     if load_mitsuba().variant().startswith("scalar"):
         pytest.skip("the scalar variant has no blur")
-    sigma, fine = 0.6, 8
+    sigma, fine = 0.6, 4
     w = world("turntable")
 
     def whole(width, height, spp, **options):
         r = MultiViewRenderer(w, cameras(w, width, height, (4,)), seed=0, spp=spp, background_spp=spp, **options)
         return r.crn_frames(0.0)[0].astype(np.float64)
 
-    blurred, sharp = whole(64, 40, 256, psf_px=sigma), whole(64, 40, 256)
-    large = gaussian_filter(whole(64 * fine, 40 * fine, 16), sigma * fine, mode="nearest")
-    expected = large.reshape(40, fine, 64, fine).mean((1, 3))
+    blurred, large = whole(64, 40, 256, psf_px=sigma), whole(64 * fine, 40 * fine, 32)
+    sharp, expected = (
+        image.reshape(40, fine, 64, fine).mean((1, 3))
+        for image in (large, gaussian_filter(large, sigma * fine, mode="nearest"))
+    )
     inside = np.s_[3:-3, 3:-3]  # beyond the image's edge only the renderer sees
     assert np.abs(sharp - expected)[inside].mean() > 0.01
     assert np.abs(blurred - expected)[inside].mean() < 0.004  # the noise of both
