@@ -224,6 +224,10 @@ def _weights(network: str) -> Path:
         from spike4dgs.method.msdi.weights import WEIGHTS as msdi
 
         return msdi.check()
+    if network == "MSDI's images":
+        from spike4dgs.method.image_network.weights import WEIGHTS as images
+
+        return images.check()
     if network == "matching":
         from spike4dgs.method.matching.weights import WEIGHTS as matching
 
@@ -234,7 +238,7 @@ def _weights(network: str) -> Path:
 
 
 # What finds the weights of a network, or raises UserError.
-_NETWORKS = ("MSDI", "matching", "Spk2ImgNet", "DUSt3R")
+_NETWORKS = ("MSDI", "MSDI's images", "matching", "Spk2ImgNet", "DUSt3R")
 NETWORKS: dict[str, Callable[[], Path]] = {name: partial(_weights, name) for name in _NETWORKS}
 
 

@@ -8,9 +8,13 @@ from tyro.conf import OmitArgPrefixes
 
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.files import sha256_file, write_text
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.cli.options import COMPUTE, Compute, check_names
+from spike4dgs.method.image_network.config import CONFIGS as IMAGE_NETWORKS
+from spike4dgs.method.image_network.config import ImageTraining
+from spike4dgs.method.image_network.training import train as image_training
+from spike4dgs.method.image_network.training.evaluate import evaluate, table
 from spike4dgs.method.matching.config import CONFIGS as MATCHERS
 from spike4dgs.method.matching.config import MatcherTraining
 from spike4dgs.method.matching.training.train import MatchTraining, run, training_key
@@ -40,23 +44,26 @@ def train_msdi(
     Args:
         data: Folder of shards; those of the hidden variants are only scored.
         out: Folder for all output.
-        config: small, paper (a GPU's work), or bottleneck (the network that matches views: of the other options it
-            takes data, out, start, steps and seed, and a larger --steps goes on where the training ended).
+        config: small, paper (a GPU's work), bottleneck (the network that matches views: of the other options it
+            takes data, out, start, steps and seed, and a larger --steps goes on where the training ended), or images
+            (the network that makes images: it takes data, out, steps, seed and device).
         start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file. The
             steps of bottleneck's weights count.
         steps: Steps.
         views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
         rate: Adam's learning rate, after the warm-up, of the layers that make points.
     """
-    check_names("--config", [config], (*CONFIGS, *MATCHERS))
+    check_names("--config", [config], (*CONFIGS, *MATCHERS, *IMAGE_NETWORKS))
     if steps < 1 or views < 2 or not rate > 0:
         found = f"{steps}, {views} and {rate}"
         raise problem("--steps, --views and --rate", "at least 1, 2 and more than 0", found, "correct them")
     learned, hidden = training_shards(data)
     if config in MATCHERS:
         return _train_matcher(learned, config, start, steps, compute.seed, out)
-    settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
     device = choose_device(compute.device, rasterizes=False)
+    if config in IMAGE_NETWORKS:
+        return _train_images(learned, hidden, config, steps, device, compute.seed, out)
+    settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
     training = Training(Bursts(learned), CONFIGS[config], settings, device, compute.seed)
     if start:
         start_from(training.network, start)
@@ -72,4 +79,17 @@ def _train_matcher(files: list[BurstFile], config: str, start: Path | None, step
     training = MatchTraining(files, MATCHERS[config], settings, seed, start)
     key = training_key(MATCHERS[config], settings, seed, sha256_file(start) if start else None)
     run(training, steps, key, out)
+    return 0
+
+
+def _train_images(
+    learned: list[BurstFile], hidden: list[BurstFile], config: str, steps: int, device: str, seed: int, out: Path
+) -> int:
+    settings = ImageTraining(steps=steps, warm_up=min(300, max(1, steps // 10)))
+    training = image_training.ImageNetworkTraining(learned, IMAGE_NETWORKS[config], settings, device, seed)
+    image_training.run(training, image_training.training_key(IMAGE_NETWORKS[config], settings, seed), out)
+    if hidden:
+        text = table(evaluate(training.network.eval(), hidden))
+        write_text(out / "scores.md", text)
+        print(f"hidden variants:\n{text}written: {out / 'scores.md'}")
     return 0

@@ -22,6 +22,7 @@ PAGES = {  # files outside docs/ that have a page on the site
     "CHANGELOG.md": "docs/changelog.md",
     "examples/README.md": "docs/external_methods.md",
     "method/msdi/README.md": "docs/methods/msdi_card.md",
+    "method/image_network/README.md": "docs/methods/images_card.md",
     "method/matching/README.md": "docs/methods/matching_card.md",
     "baselines/images/spk2img/README.md": "docs/methods/spk2img_card.md",
 }

@@ -12,9 +12,9 @@ from typing import Any
 from spike4dgs.benchmark.method import Method, Recipe
 from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.method.fit import Parts, RecipeMethod
+from spike4dgs.method.image_network.maker import MSDI
 from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.intervals import INTERVALS
-from spike4dgs.method.images.msdi import MSDI
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.starts.base import Initialization
 from spike4dgs.method.starts.matching import MatchedSettings, matched

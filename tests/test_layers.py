@@ -29,8 +29,8 @@ ORDER = {
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "truth held_frames previews scene_maker shared_rendering scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat array_path gaussians training_views motion supervision "
-    "pose_refinement schedule models checkpoint msdi images matching starts self_calibration trainer tuned pace fit "
-    "recipes viewing recordings",
+    "pose_refinement schedule models checkpoint msdi images matching image_network starts self_calibration "
+    "trainer tuned pace fit recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render exposure starts tracking spacetime recipes",
     "leaderboard": "tracks thumbnails entry reading truth_check rank verify submit page season",
     "studies": "kit sensors hard_cases speed_error gpu_receipt images recorder_runs recorder saved_models modality "

@@ -13,10 +13,10 @@ from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.image_network.maker import MSDI
 from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.intervals import INTERVALS
-from spike4dgs.method.images.msdi import MSDI
 
 OURS = (TFP, TFI, TFSTP, SPK2IMG, ADAPTIVE, INTERVALS, MSDI)
 IMAGES: dict[str, ImageMaker] = Table("image makers", {maker.name: maker for maker in (*OURS, *PUBLISHED)})

@@ -50,13 +50,13 @@ class Extractor(nn.Module):
         super().__init__()
         a, b, c, d = config.widths
         self.stem = nn.Conv2d(CHANNELS, a, 3, padding=1)
-        self.to_two = nn.Sequential(_down(a, b), _Residual(b))
-        self.to_four = nn.Sequential(_down(b, c), _Residual(c))
-        self.to_eight = nn.Sequential(_down(c, d), _Residual(d), _Residual(d))
-        self.from_eighth, self.coarse = nn.Conv2d(d, c, 1), _Residual(c)
+        self.to_two = nn.Sequential(down(a, b), Residual(b))
+        self.to_four = nn.Sequential(down(b, c), Residual(c))
+        self.to_eight = nn.Sequential(down(c, d), Residual(d), Residual(d))
+        self.from_eighth, self.coarse = nn.Conv2d(d, c, 1), Residual(c)
         self.describe = nn.Conv2d(c, c, 1)
         self.from_quarter, self.from_half = nn.Conv2d(c, config.fine, 1), nn.Conv2d(b, config.fine, 1)
-        self.fine = nn.Sequential(_Residual(config.fine), nn.Conv2d(config.fine, config.fine, 1))
+        self.fine = nn.Sequential(Residual(config.fine), nn.Conv2d(config.fine, config.fine, 1))
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, a=_SLOPE)
@@ -151,7 +151,7 @@ def middle_of_cell(uv: Tensor) -> Tensor:
     return ((uv / COARSE).floor() + 0.5) * COARSE
 
 
-class _Residual(nn.Module):
+class Residual(nn.Module):
     """Two convolutions beside the identity; the second begins at a fraction, so that depth does not add up."""
 
     def __init__(self, width: int) -> None:
@@ -159,9 +159,11 @@ class _Residual(nn.Module):
         self.first, self.second = nn.Conv2d(width, width, 3, padding=1), nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return [N, width, H, W] of the same size."""
         y = self.second(functional.leaky_relu(self.first(x), _SLOPE))
         return functional.leaky_relu(x + 0.5 * y, _SLOPE)
 
 
-def _down(inputs: int, outputs: int) -> nn.Module:
+def down(inputs: int, outputs: int) -> nn.Module:
+    """Return a layer that halves an image's sides, rounded up."""
     return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.LeakyReLU(_SLOPE))

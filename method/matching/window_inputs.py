@@ -15,6 +15,8 @@ The root makes shot noise alike in the dark and in the light; the mean takes out
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Float32
@@ -33,20 +35,47 @@ def window_inputs(stream: SpikeStream, tick: int, sensor: Maps | None = None) ->
 
     A pixel without sensitivity has rate 0.
     """
+    windows = rates_over_windows(stream, tick, sensor)
+    roots = np.minimum(windows.roots(), _MOST - 1)
+    return np.stack([roots[0], windows.log_length, roots[1], roots[2]]).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """What a pixel's own spikes say at a tick, corrected for the sensor where that is known."""
+
+    rates: Float32  # [3, H, W] spikes per tick over adaptive's window, the shortest, and the whole stream
+    log_length: Float32  # [H, W] log2 of the ticks of adaptive's, over 8
+    mean: float  # spikes per tick of the image over the whole stream
+
+    def roots(self) -> Float32:
+        """Return roots of the rates in roots of the mean, less 1."""
+        return roots_of(self.rates, self.mean)
+
+
+def rates_over_windows(stream: SpikeStream, tick: int, sensor: Maps | None = None) -> Windows:
+    """Return rates over three windows at the start of `tick`."""
     settings = AdaptiveSettings()
     levels = shared_levels(stream, tick, settings)
-    shortest = np.zeros_like(levels)
-    found = [rates(stream, tick, settings, which) for which in (levels, shortest)]
+    found = [rates(stream, tick, settings, which) for which in (levels, np.zeros_like(levels))]
     ticks = np.minimum(2 * half_windows(stream.n_ticks, settings)[levels], stream.n_ticks)
     adaptive, short, length = (_upright(stream, image) for image in (*found, ticks.astype(np.float32)))
     whole = stream.counts(0, min(stream.n_ticks, 65535)).astype(np.float32) / min(stream.n_ticks, 65535)
-    images = np.stack([adaptive, short, whole])
+    images = corrected_rates(np.stack([adaptive, short, whole]), sensor)
+    return Windows(images, np.asarray(np.log2(length) / 8, np.float32), max(float(images[2].mean()), _LEAST))
+
+
+def corrected_rates(images: Float32, sensor: Maps | None) -> Float32:
+    """Return the rates [..., H, W] of an ideal sensor, not negative."""
     if sensor:
         gain, dark = sensor
         images = (images - dark) * np.where(gain > 0, 1 / np.where(gain > 0, gain, 1), 0)
-    images = np.maximum(images, 0)
-    roots = np.minimum(np.sqrt(images / max(float(images[2].mean()), _LEAST)), _MOST) - 1
-    return np.stack([roots[0], np.log2(length) / 8, roots[1], roots[2]]).astype(np.float32)
+    return np.maximum(images, 0)
+
+
+def roots_of(rates: Float32, mean: float) -> Float32:
+    """Return roots of rates in roots of `mean`, less 1."""
+    return np.asarray(np.sqrt(rates / mean) - 1, np.float32)
 
 
 def light_of(roots: Float32) -> Float32:

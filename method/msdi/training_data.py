@@ -39,7 +39,8 @@ class Pixels:
     """Pixels of some cameras and the light on them: arrays over pixels, in any shape after the first axis of `rates`.
 
     Attributes:
-        rates: [k, ...] spikes per tick that the light asks for, at k instants evenly from -REACH to REACH ticks.
+        rates: [k, ...] spikes per tick that the light asks for, at k instants evenly from -REACH to REACH ticks, or
+            `spacing` ticks apart from the start of the first tick on.
         gain: [...] relative sensitivity.
         dark: [...] spikes per tick in the dark.
         photons: number of photons per spike, for shot noise; infinity means none.
@@ -49,6 +50,7 @@ class Pixels:
     gain: Float32
     dark: Float32
     photons: float
+    spacing: int | None = None
 
 
 def make_spikes(pixels: Pixels, ticks: int, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -70,18 +72,19 @@ def fire(pixels: Pixels, ticks: int, charge: Float32, rng: np.random.Generator) 
     spikes = np.empty((ticks, charge.size), np.uint8)
     rates = np.ascontiguousarray(pixels.rates.reshape(len(pixels.rates), -1))
     gain, dark, charge_before = (np.ascontiguousarray(a).ravel() for a in (pixels.gain, pixels.dark, charge))
-    first = REACH - ticks // 2
-    _integrate(rates, gain, dark, charge_before, deviates, starts, 1 + cutoff * sd, first, spikes)
+    spacing = pixels.spacing or 2 * REACH // (len(rates) - 1)
+    first = 0 if pixels.spacing else REACH - ticks // 2
+    _integrate(rates, gain, dark, charge_before, deviates, starts, 1 + cutoff * sd, (first, spacing), spikes)
     return spikes.reshape(ticks, *charge.shape)
 
 
 @kernel
 def _integrate(
-    rates: Any, gain: Any, dark: Any, charge: Any, deviates: Any, starts: Any, most: float, first: int, spikes: Any
+    rates: Any, gain: Any, dark: Any, charge: Any, deviates: Any, starts: Any, most: float, at: Any, spikes: Any
 ) -> None:
-    """Fill spikes [T, N] of ticks first, first + 1, ... after the first of the images rates [k, N]."""
+    """Fill spikes [T, N] of ticks first, first + 1, ... after the first of the images rates [k, N], `spacing` apart."""
     count, n = rates.shape
-    spacing = 2 * REACH // (count - 1)
+    first, spacing = at
     for p in range(n):
         level, number = np.float64(charge[p]), int(starts[p])
         for t in range(len(spikes)):

@@ -1,4 +1,4 @@
-"""Losses and networks: SSIM's fused kernel, HexPlane's lookup and MSDI's image generator, against torch in float64."""
+"""Losses and networks: SSIM's fused kernel, HexPlane's lookup and MSDI's image network, against torch in float64."""
 
 from __future__ import annotations
 
@@ -7,20 +7,25 @@ from copy import deepcopy
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from spike4dgs.benchmark.metrics.ssim_window import SSIM_SIGMA
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.method.image_network.inputs import image_inputs
+from spike4dgs.method.image_network.network import ImageNetwork, rate_of
+from spike4dgs.method.image_network.weights import WEIGHTS, load_image_network
 from spike4dgs.method.motion.hexplane import sample_level
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.msdi.network import has_bfloat16
-from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 from spike4dgs.method.splat.ssim import C1, C2, RADIUS, ssim, ssim_reference
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.studies.kit.measurement import TIMES, Column, Request, Series, compared, max_rms, measurement
 
 GROUP = "Losses and networks"
+_TICKS = 100  # of the streams that images are made of
 
 
 def differentiate(function: Callable[[Tensor, Tensor], Tensor], image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,39 +105,43 @@ def fused_ssim(request: Request) -> Iterator[Series]:
 @measurement(
     "msdi",
     GROUP,
-    "MSDI: numbers of its image generator",
+    "MSDI: numbers of its image network",
     (*TIMES, Column("rms", "RMS error, spikes per tick"), Column("max", "largest error, spikes per tick")),
     ("rms",),
     least="quick",  # loading the network takes longer than the others of tiny
 )
 def msdi_images(request: Request) -> Iterator[Series]:
-    """Weights are kept as half floats; features are bfloat16 where the processor multiplies them.
+    """Weights are kept as half floats; convolutions are bfloat16 where the processor multiplies it.
 
     The same weights in float64.
 
-    Features in bfloat16 change an image less than one spike in a window does. On processors without its instructions it
-    is slower, and float32 is chosen.
+    Convolutions in bfloat16 change an image less than one spike in a window does. On processors without its
+    instructions it is slower, and float32 is chosen.
 
-    tests/method/msdi
+    tests/method/image_network
     """
-    network = load_network(WEIGHTS.in_use().path, "cpu").eval()
+    network = load_image_network(WEIGHTS.in_use().path, "cpu")
     height, width = request.pick((16, 24), (40, 64), (125, 200))
-    g = torch.Generator().manual_seed(request.seed)
-    rates = {
-        "random light": torch.rand(1, 1, height, width, generator=g),
-        "dark": torch.full((1, 1, height, width), 0.01),
-    }
+    rng = np.random.default_rng(request.seed)
+    rates = {"random light": rng.random((height, width)), "dark": np.full((height, width), 0.01)}
     exact = deepcopy(network).double()
-    chosen = "features in bfloat16" if has_bfloat16(torch.device("cpu")) else "float32"
+    chosen = "convolutions in bfloat16" if has_bfloat16(torch.device("cpu")) else "float32"
     for name, rate in rates.items():
-        spikes = (torch.rand(1, network.config.ticks, height, width, generator=g) < 0.6 * rate).to(torch.uint8)
+        spikes = rng.random((_TICKS, height, width)) < 0.6 * rate
+        found = image_inputs(SpikeStream(pack(spikes), width, height, 20_000.0), _TICKS // 2)
+        channels, seen = (torch.from_numpy(a)[None] for a in (found.channels, found.spikes))
         calls = {
-            "float64": partial(exact.images, spikes.double()),
-            "float32": partial(network.images, spikes),
-            "features in bfloat16": partial(network.images, spikes, half=True),
+            "float64": partial(_rates, exact, channels.double(), seen, found.unit),
+            "float32": partial(_rates, network, channels, seen, found.unit),
+            "convolutions in bfloat16": partial(_rates, network, channels, seen, found.unit, half=True),
         }
         with torch.inference_mode(), one_torch_thread():
             yield compared(f"{name}, {width}x{height}", calls, max_rms, request.pick(1, 2, 5), chosen)
+
+
+def _rates(network: ImageNetwork, channels: Tensor, spikes: Tensor, unit: float, *, half: bool = False) -> Tensor:
+    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+        return rate_of(network(channels, spikes), unit)
 
 
 @measurement(

@@ -169,10 +169,12 @@ def test_bad_arguments_are_one_line_and_write_nothing(
 def test_a_network_without_weights_says_what_it_needs(
     dat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("SPIKE4DGS_MSDI", str(tmp_path / "absent.safetensors"))
+    monkeypatch.setenv("SPIKE4DGS_IMAGES", str(tmp_path / "absent.safetensors"))
     assert main(["images", str(dat), *SIZE, "--method", "msdi", "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
-    assert "expected weights of MSDI" in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+    assert (
+        "expected weights of the image network" in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+    )
 
 
 @pytest.mark.parametrize("method", ["adaptive", "intervals", "tfi"])

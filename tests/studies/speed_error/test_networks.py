@@ -18,7 +18,7 @@ def test_the_lookups_kernels_agree_with_float64() -> None:
 def test_bfloat16_changes_an_image_less_than_a_spike_in_a_window() -> None:
     for series in msdi_images.run(REQUEST):
         rms = {p.name: p.values["rms"] for p in series.points}
-        assert rms["float32"] < 1e-5 < rms["features in bfloat16"] < 1 / 41
+        assert rms["float32"] < 1e-5 < rms["convolutions in bfloat16"] < 1 / 41
 
 
 def test_ssim_keeps_its_digits_where_variances_do_not_cancel() -> None:

@@ -1,19 +1,22 @@
-"""The image maker `msdi`: MSDI's image generator (eq. 12) on the ticks around an instant, view by view."""
+"""The image maker `msdi`: MSDI's image network at an instant, view by view."""
 
 from __future__ import annotations
 
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.method.images.base import ImageMaker, learned_from, window
-from spike4dgs.method.msdi.weights import WEIGHTS, load_network
+from spike4dgs.method.image_network.inputs import image_inputs
+from spike4dgs.method.image_network.weights import WEIGHTS, load_image_network
+from spike4dgs.method.images.base import ImageMaker, learned_from
 
 if TYPE_CHECKING:
-    from spike4dgs.method.msdi.network import Msdi
+    from spike4dgs.method.image_network.network import ImageNetwork
 
 
 def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None, device: str = "auto") -> Float32:
@@ -23,31 +26,29 @@ def msdi_image(stream: SpikeStream, tick: int, camera: Calibration | None = None
     the weights are missing or damaged.
     """
     chosen = choose_device(device, rasterizes=False)
-    return reconstruct(load_network(WEIGHTS.in_use().path, chosen), stream, tick, camera)
+    return reconstruct(load_image_network(WEIGHTS.in_use().path, chosen), stream, tick, camera)
 
 
-def reconstruct(network: Msdi, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
+def reconstruct(network: ImageNetwork, stream: SpikeStream, tick: int, camera: Calibration | None = None) -> Float32:
     """Return the estimate of `network` at the start of `tick`: spikes per tick [H, W] float32, not negative."""
     import torch  # imported where it is used: reading spikes must not wait for it
 
-    from spike4dgs.method.msdi.inputs import Sensors
+    from spike4dgs.method.image_network.network import rate_of
     from spike4dgs.method.msdi.network import has_bfloat16
 
     device = next(network.parameters()).device
-    sensors = None
-    if camera:
-        sensors = Sensors(*(torch.from_numpy(a).to(device)[None] for a in (camera.gain, camera.dark)))
-    with torch.inference_mode():
-        spikes = torch.from_numpy(window(stream, tick, network.config.ticks)).to(device)[None]
-        rate: Float32 = network.images(spikes, sensors, half=has_bfloat16(device))[0].clamp(min=0).cpu().numpy()
-    return rate
+    found = image_inputs(stream, tick, (camera.gain, camera.dark) if camera else None)
+    with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=has_bfloat16(device)):
+        channels, spikes = (torch.from_numpy(a).to(device)[None] for a in (found.channels, found.spikes))
+        rate = rate_of(network(channels, spikes)[0], found.unit).cpu().numpy()
+    return np.asarray(rate, np.float32)
 
 
 def msdi_maker(device: str) -> ImageMaker:
     """Return the image maker whose network runs on `device`."""
     return ImageMaker(
         name="msdi",
-        definition="MSDI's image generator on the 41 ticks around tick t",
+        definition="MSDI's image network: adaptive's windows and the 41 ticks around tick t",
         source="Spike4DGS, eq. 12",
         rate=lambda stream, tick, _: msdi_image(stream, tick, device=device),
         learned=partial(learned_from, WEIGHTS.in_use, WEIGHTS.read_card),

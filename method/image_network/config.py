@@ -1,0 +1,42 @@
+"""Sizes of the image network, and the numbers of its training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spike4dgs.method.gaussians.optimizer import WarmCosine
+
+
+@dataclass(frozen=True)
+class ImageConfig:
+    """Widths in channels."""
+
+    name: str = "images"
+    widths: tuple[int, int, int] = (32, 64, 96)  # at the image's size, at half, and at a quarter
+    deepest: int = 2  # residual blocks at a quarter of the size
+
+
+IMAGES = ImageConfig()
+TINY = ImageConfig("images-tiny", (4, 6, 8), 1)  # for tests
+CONFIGS = {config.name: config for config in (IMAGES, TINY)}
+
+
+@dataclass(frozen=True)
+class ImageTraining:
+    """Hyper-parameters."""
+
+    steps: int = 12_000
+    bursts: int = 4  # of a step
+    views: int = 2  # of a burst, each a clip of its own
+    instants: int = 4  # of a clip
+    crop: tuple[int, int] = (64, 96)  # height and width in px; less where images are smaller
+    moving: float = 0.75  # share of the clips in which something moves
+    well_lit: float = 0.5  # share of the clips in at least half of the light; the others have down to a sixteenth
+    lr: float = 1e-3  # Adam's, after the warm-up; it falls to 0 with the cosine
+    warm_up: int = 300  # steps
+    unknown_sensors: float = 0.3  # of the bursts
+    longest: int = 600  # ticks of a clip
+
+    def learning_rate(self, step: int) -> float:
+        """Return Adam's learning rate at a step."""
+        return WarmCosine(self.lr, self.warm_up, self.steps).at(step)
