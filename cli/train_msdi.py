@@ -46,7 +46,7 @@ def train_msdi(
         out: Folder for all output.
         config: small, paper (a GPU's work), bottleneck (the network that matches views: of the other options it
             takes data, out, start, steps and seed, and a larger --steps goes on where the training ended), or images
-            (the network that makes images: it takes data, out, steps, seed and device).
+            (the network that makes images: it takes data, out, start, steps, seed and device).
         start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file. The
             steps of bottleneck's weights count.
         steps: Steps.
@@ -62,7 +62,7 @@ def train_msdi(
         return _train_matcher(learned, config, start, steps, compute.seed, out)
     device = choose_device(compute.device, rasterizes=False)
     if config in IMAGE_NETWORKS:
-        return _train_images(learned, hidden, config, steps, device, compute.seed, out)
+        return _train_images((learned, hidden), config, start, steps, device, compute.seed, out)
     settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
     training = Training(Bursts(learned), CONFIGS[config], settings, device, compute.seed)
     if start:
@@ -83,11 +83,19 @@ def _train_matcher(files: list[BurstFile], config: str, start: Path | None, step
 
 
 def _train_images(
-    learned: list[BurstFile], hidden: list[BurstFile], config: str, steps: int, device: str, seed: int, out: Path
+    files: tuple[list[BurstFile], list[BurstFile]],
+    config: str,
+    start: Path | None,
+    steps: int,
+    device: str,
+    seed: int,
+    out: Path,
 ) -> int:
+    learned, hidden = files
     settings = ImageTraining(steps=steps, warm_up=min(300, max(1, steps // 10)))
-    training = image_training.ImageNetworkTraining(learned, IMAGE_NETWORKS[config], settings, device, seed)
-    image_training.run(training, image_training.training_key(IMAGE_NETWORKS[config], settings, seed), out)
+    training = image_training.ImageNetworkTraining(learned, IMAGE_NETWORKS[config], settings, device, seed, start)
+    key = image_training.training_key(IMAGE_NETWORKS[config], settings, seed, sha256_file(start) if start else None)
+    image_training.run(training, key, out)
     if hidden:
         text = table(evaluate(training.network.eval(), hidden))
         write_text(out / "scores.md", text)

@@ -13,6 +13,7 @@ from spike4dgs.method.image_network.config import ImageConfig
 from spike4dgs.method.image_network.inputs import CHANNELS
 from spike4dgs.method.images.base import WINDOW
 from spike4dgs.method.matching.network import Residual, down
+from spike4dgs.method.msdi.extractor import initialize
 
 _SIDE = 4  # px: sides are padded to multiples of it
 
@@ -30,10 +31,7 @@ class ImageNetwork(nn.Module):
         self.from_four, self.two = nn.Conv2d(c, b, 1), Residual(b)
         self.from_two, self.one = nn.Conv2d(b, a, 1), Residual(a)
         self.change = nn.Conv2d(a, 1, 3, padding=1)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, a=0.1)
-                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+        initialize(self)
         nn.init.zeros_(self.change.weight)
 
     def forward(self, channels: Tensor, spikes: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from spike4dgs.method.matching.config import MatcherConfig
 from spike4dgs.method.matching.window_inputs import CHANNELS
+from spike4dgs.method.msdi.extractor import initialize
 
 COARSE, FINE = 4, 2  # px, widths of the cells
 POINT = 2.5  # px from a coarse cell's corner to its point, both ways
@@ -57,10 +58,7 @@ class Extractor(nn.Module):
         self.describe = nn.Conv2d(c, c, 1)
         self.from_quarter, self.from_half = nn.Conv2d(c, config.fine, 1), nn.Conv2d(b, config.fine, 1)
         self.fine = nn.Sequential(Residual(config.fine), nn.Conv2d(config.fine, config.fine, 1))
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, a=_SLOPE)
-                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+        initialize(self)
 
     def forward(self, inputs: Tensor) -> Features:
         """Return the features of `inputs` [N, 4, H, W]."""

@@ -2,56 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.matching.config import CONFIGS
-from spike4dgs.method.models.network_weights import WeightKind
+from spike4dgs.method.models.network_weights import ConfigCard, ConfigWeights
 
 if TYPE_CHECKING:
     from spike4dgs.method.matching.network import Matcher
 
 VARIABLE = "SPIKE4DGS_MATCHER"  # the environment variable that names another weight file
 SHIPPED = Path(__file__).with_name("matcher.safetensors")
-
-
-@dataclass(frozen=True)
-class MatcherCard:
-    """The card in a weight file: where the weights come from."""
-
-    config: str  # name of the configuration
-    steps: int
-    seed: int
-    trained_on: tuple[str, ...]  # shards, as ID@SHA256
-
-
-def _check_card(card: MatcherCard, path: Path) -> None:
-    if card.config not in CONFIGS:
-        raise problem(path, f"a configuration of {', '.join(CONFIGS)}", repr(card.config), WEIGHTS.fix)
-
-
-WEIGHTS = WeightKind(
+WEIGHTS = ConfigWeights(
     network="the matching network",
     schema="spike4dgs-matcher/1",
-    card=MatcherCard,
+    card=ConfigCard,
     variable=VARIABLE,
     shipped=SHIPPED,
     command="train-msdi --config bottleneck",
-    check_card=_check_card,
+    configs=CONFIGS,
 )
 
 
 @cache
 def load_matcher(path: Path, device: str) -> Matcher:
     """Return the trained network on `device`, ready to run. Raises UserError for a damaged or foreign file."""
-    import torch
-
     from spike4dgs.method.matching.network import Matcher
 
-    config = CONFIGS[WEIGHTS.read_card(path).config]
-    with torch.device("meta"):  # parameters need not be drawn at random first
-        network = Matcher(config)
-    return WEIGHTS.fill(path, network, f"configuration {config.name}").to(device)
+    return WEIGHTS.load(path, device, lambda name: Matcher(CONFIGS[name]))

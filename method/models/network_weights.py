@@ -6,7 +6,7 @@ Each network states its facts as a `WeightKind`. Files are found, checked and re
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -34,7 +34,6 @@ class WeightKind(Generic[CardT]):
     variable: str  # the environment variable that names a file in place of the shipped one
     shipped: Path
     command: str  # the command that trains it
-    check_card: Callable[[CardT, Path], None] = lambda card, path: None  # raises UserError for one that is not known
 
     @property
     def fix(self) -> str:
@@ -85,7 +84,6 @@ class WeightKind(Generic[CardT]):
             card = self.card(**{**fields, "trained_on": tuple(fields["trained_on"])})
         except (LookupError, TypeError, ValueError) as e:
             raise problem(path, self.description, f"damaged data in its card ({e})", self.fix) from None
-        self.check_card(card, path)
         return card
 
     def fill(self, path: Path, network: NetworkT, shape: str) -> NetworkT:
@@ -96,3 +94,42 @@ class WeightKind(Generic[CardT]):
         """
         state = read_tensors(path, self.description, self.fix)
         return load_into(network, state, path, f"parameters of {shape}", self.fix)
+
+
+@dataclass(frozen=True)
+class ConfigCard:
+    """The card of a network that has named configurations."""
+
+    config: str  # name of the configuration
+    steps: int
+    seed: int
+    trained_on: tuple[str, ...]  # shards, as ID@SHA256
+
+
+ConfigCardT = TypeVar("ConfigCardT", bound=ConfigCard)
+
+
+@dataclass(frozen=True)
+class ConfigWeights(WeightKind[ConfigCardT]):
+    """The weight files of a network that has named configurations."""
+
+    configs: Collection[str] = ()  # their names
+
+    def read_card(self, path: Path) -> ConfigCardT:
+        """Return the file's card. Raises UserError also for a configuration that is not known."""
+        card = super().read_card(path)
+        if card.config not in self.configs:
+            raise problem(path, f"a configuration of {', '.join(self.configs)}", repr(card.config), self.fix)
+        return card
+
+    def load(self, path: Path, device: str, build: Callable[[str], NetworkT]) -> NetworkT:
+        """Return the file's network, which `build` makes of its configuration, on `device`, ready to run.
+
+        Raises UserError for a damaged or foreign file.
+        """
+        import torch
+
+        config = self.read_card(path).config
+        with torch.device("meta"):  # parameters need not be drawn at random first
+            network = build(config)
+        return self.fill(path, network, f"configuration {config}").to(device)

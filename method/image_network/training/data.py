@@ -19,7 +19,6 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.image_network.config import ImageTraining
 from spike4dgs.method.image_network.inputs import image_inputs
 from spike4dgs.method.image_network.training.sprites import Clip, still, with_sprites
-from spike4dgs.method.matching.config import MatcherTraining
 from spike4dgs.method.matching.training.data import RATE_HZ, Recording, drawn
 from spike4dgs.method.msdi.training_data import Pixels, fire
 
@@ -65,7 +64,7 @@ def _sample(burst: Burst, file: BurstFile, view: int, settings: ImageTraining, r
     images = burst.keys[len(burst.keys) // 2]
     facts = file.facts
     size = [min(*pair) for pair in zip(images.shape[1:], settings.crop, strict=True)]
-    under = drawn(False, MatcherTraining(unknown_sensors=settings.unknown_sensors, longest=settings.longest), rng)
+    under = drawn(False, settings, rng)
     if rng.random() < settings.well_lit:
         under = replace(under, light=float(rng.uniform(0.5, 1)))
     image = _part(images[view], size, rng) * np.float32(_BRIGHTER ** rng.uniform(-1, 1))

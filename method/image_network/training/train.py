@@ -25,8 +25,9 @@ from spike4dgs.method.gaussians.optimizer import make_adam
 from spike4dgs.method.image_network.config import ImageConfig, ImageTraining
 from spike4dgs.method.image_network.network import ImageNetwork, log_mse
 from spike4dgs.method.image_network.training.data import ImageBatch, draw
-from spike4dgs.method.image_network.weights import WEIGHTS, ImageCard
+from spike4dgs.method.image_network.weights import WEIGHTS
 from spike4dgs.method.matching.training.train import note_shards
+from spike4dgs.method.models.network_weights import ConfigCard
 from spike4dgs.method.msdi.records import Curve
 
 ROW_EVERY = 100  # steps between rows of the losses
@@ -124,9 +125,9 @@ def _same(batch: Any) -> Any:  # what DataLoader would stack
     return batch
 
 
-def training_key(config: ImageConfig, settings: ImageTraining, seed: int) -> str:
-    """Return the hash that ties a checkpoint to its training."""
-    return sha256_json([asdict(config), asdict(settings), seed])
+def training_key(config: ImageConfig, settings: ImageTraining, seed: int, start: str | None = None) -> str:
+    """Return the hash that ties a checkpoint to its training; `start` is the SHA-256 of the weights that began it."""
+    return sha256_json([asdict(config), asdict(settings), seed, start])
 
 
 def run(training: ImageNetworkTraining, key: str, out: Path) -> None:
@@ -154,7 +155,7 @@ def run(training: ImageNetworkTraining, key: str, out: Path) -> None:
             WEIGHTS.save(
                 out / "images.safetensors",
                 training.network,
-                ImageCard(training.network.config.name, step, training.seed, seen),
+                ConfigCard(training.network.config.name, step, training.seed, seen),
             )
             curve.write()
             saved = now

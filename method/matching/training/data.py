@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -45,7 +46,19 @@ class Recording:
     known: bool = True  # the sensors are
 
 
-def drawn(moves: bool, settings: MatcherTraining, rng: np.random.Generator) -> Recording:
+class Conditions(Protocol):
+    """What a training says of its recordings."""
+
+    @property
+    def longest(self) -> int:
+        """Ticks of a clip at most."""
+
+    @property
+    def unknown_sensors(self) -> float:
+        """Share of the recordings."""
+
+
+def drawn(moves: bool, settings: Conditions, rng: np.random.Generator) -> Recording:
     """Return random conditions; where something moves the clip is as short as a burst."""
     ticks = _SHORTEST
     if not moves:

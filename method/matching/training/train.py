@@ -25,7 +25,8 @@ from spike4dgs.method.matching.config import MatcherConfig, MatcherTraining
 from spike4dgs.method.matching.network import Matcher
 from spike4dgs.method.matching.training.data import draw
 from spike4dgs.method.matching.training.losses import MatchLosses, match_losses
-from spike4dgs.method.matching.weights import WEIGHTS, MatcherCard
+from spike4dgs.method.matching.weights import WEIGHTS
+from spike4dgs.method.models.network_weights import ConfigCard
 from spike4dgs.method.msdi.records import Curve
 from spike4dgs.method.torch_state import one_torch_thread, seeded
 
@@ -143,7 +144,7 @@ def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s:
         if now - saved > save_every_s or step == steps:
             training.save(checkpoint, key)
             config = training.network.config.name
-            WEIGHTS.save(out / "matcher.safetensors", training.network, MatcherCard(config, step, training.seed, seen))
+            WEIGHTS.save(out / "matcher.safetensors", training.network, ConfigCard(config, step, training.seed, seen))
             curve.write()
             saved = now
 

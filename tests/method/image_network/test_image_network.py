@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
 
@@ -188,6 +189,18 @@ def test_a_killed_training_goes_on_with_the_same_bits(tmp_path: Path, files) -> 
         assert torch.equal(tensor, saved[1].tensors[name]), name
     card = WEIGHTS.read_card(tmp_path / "whole" / "images.safetensors")
     assert card.steps == 6 and len(card.trained_on) == 2
+
+
+def test_a_training_begins_with_given_weights_and_their_shards(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]
+    run(ImageNetworkTraining(files[:1], TINY, SETTINGS, "cpu", 0), training_key(TINY, SETTINGS, 0), tmp_path)
+    weights = tmp_path / "images.safetensors"
+    training = ImageNetworkTraining(files[1:], TINY, SETTINGS, "cpu", 0, weights)
+    for name, tensor in load_file(weights).items():
+        assert torch.equal(training.network.state_dict()[name], tensor.float()), name
+    assert training.step == 0 and all(p.requires_grad for p in training.network.parameters())
+    run(training, training_key(TINY, SETTINGS, 0, "sha"), tmp_path / "on")
+    assert len(WEIGHTS.read_card(tmp_path / "on" / "images.safetensors").trained_on) == 2
+    assert training_key(TINY, SETTINGS, 0, "sha") != training_key(TINY, SETTINGS, 0)
 
 
 def test_scores_of_an_untrained_network_are_adaptives(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ from spike4dgs.method.matching.network import Matcher, points_of_cells
 from spike4dgs.method.matching.poses import solve
 from spike4dgs.method.matching.tracks import Matches, PairMatches
 from spike4dgs.method.matching.training.truth import correspond
-from spike4dgs.method.matching.weights import VARIABLE, WEIGHTS, MatcherCard, load_matcher
+from spike4dgs.method.matching.weights import VARIABLE, WEIGHTS, load_matcher
+from spike4dgs.method.models.network_weights import ConfigCard
 from spike4dgs.method.starts.matching import in_scene, match_and_solve, matched, refined_poses, seen_inputs
 
 WORLD = ToyWorld(width=96, height=61, n_ticks=80, seed=1)
@@ -104,7 +105,7 @@ def test_the_network_in_use_is_that_of_the_variable(tmp_path: Path, monkeypatch:
     torch.manual_seed(0)
     network = Matcher(TINY)
     path = tmp_path / "matcher.safetensors"
-    WEIGHTS.save(path, network, MatcherCard(TINY.name, 3, 0, ("toy-13@0",)))
+    WEIGHTS.save(path, network, ConfigCard(TINY.name, 3, 0, ("toy-13@0",)))
     loaded = load_matcher(path, "cpu")
     x = torch.randn(1, 4, 32, 40)
     with torch.no_grad():
