@@ -83,6 +83,8 @@ def test_relative_links_resolve() -> None:
             continue
         found = page.parent / name if name else page
         assert found.exists(), f"{named(page)} links to {target}"
+        if page.is_relative_to(DOCS):
+            assert found.resolve().is_relative_to(DOCS), f"{named(page)} links out of the site, to {target}"
         if anchor and found.suffix == ".md" and "<!-- include" not in found.read_text():
             assert anchor in anchors(found), f"{named(page)} links to {target}"
 
