@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from spike4dgs.method.gaussians.optimizer import WarmCosine
 
@@ -14,11 +14,23 @@ class ImageConfig:
     name: str = "images"
     widths: tuple[int, int, int] = (32, 64, 96)  # at the image's size, at half, and at a quarter
     deepest: int = 2  # residual blocks at a quarter of the size
+    without: str = ""  # for ablations: a name of `INPUTS` that the network does not see, or `MOVING_LOSS`
 
+
+INPUTS = {  # first and last channel of what the network sees beside `adaptive`'s image; the spikes are the last
+    "error-bar": (1, 1),
+    "windows": (2, 3),
+    "beside": (4, 5),
+    "sensor": (6, 7),
+    "spikes": (8, 48),
+}
+MOVING_LOSS = "moving-loss"  # the second term of the loss, of where things move
 
 IMAGES = ImageConfig()
 TINY = ImageConfig("images-tiny", (4, 6, 8), 1)  # for tests
-CONFIGS = {config.name: config for config in (IMAGES, TINY)}
+HALF = ImageConfig("images-half", (16, 32, 48))  # for ablations, which a CPU trains
+ABLATIONS = tuple(replace(HALF, name=f"{HALF.name}-without-{part}", without=part) for part in (*INPUTS, MOVING_LOSS))
+CONFIGS = {config.name: config for config in (IMAGES, TINY, HALF, *ABLATIONS)}
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from spike4dgs.method.image_network.config import ImageConfig
+from spike4dgs.method.image_network.config import INPUTS, ImageConfig
 from spike4dgs.method.image_network.inputs import CHANNELS
 from spike4dgs.method.images.base import WINDOW
 from spike4dgs.method.matching.network import Residual, down
@@ -42,7 +42,10 @@ class ImageNetwork(nn.Module):
         height, width = channels.shape[2:]
         sensitivity = 1 + channels[:, 6:7]
         seen = spikes.to(channels) * torch.where(sensitivity > 0, 1 / sensitivity, 0.0)
-        x = functional.pad(torch.cat([channels, seen], dim=1), (0, -width % _SIDE, 0, -height % _SIDE))
+        x = torch.cat([channels, seen], dim=1)
+        if hidden := INPUTS.get(self.config.without):
+            x[:, hidden[0] : hidden[1] + 1] = 0
+        x = functional.pad(x, (0, -width % _SIDE, 0, -height % _SIDE))
         full = self.stem(x.contiguous(memory_format=torch.channels_last))  # convolutions take two thirds of the time
         half = self.to_two(full)
         quarter = self.from_four(self.to_four(half))

@@ -22,7 +22,7 @@ from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import make_adam
-from spike4dgs.method.image_network.config import ImageConfig, ImageTraining
+from spike4dgs.method.image_network.config import MOVING_LOSS, ImageConfig, ImageTraining
 from spike4dgs.method.image_network.network import ImageNetwork, log_mse
 from spike4dgs.method.image_network.training.data import ImageBatch, draw
 from spike4dgs.method.image_network.weights import WEIGHTS
@@ -104,7 +104,8 @@ class ImageNetworkTraining:
             found = self.network(channels, spikes)
         losses = torch.stack([log_mse(found, truth, weight) for weight in weights])
         self.adam.zero_grad(set_to_none=True)
-        losses.sum().backward()  # type: ignore[no-untyped-call]
+        asked = losses[:1] if self.network.config.without == MOVING_LOSS else losses
+        asked.sum().backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         for group in self.adam.param_groups:
             group["lr"] = self.settings.learning_rate(self.step)

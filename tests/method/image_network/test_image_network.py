@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from toy_world import ToyWorld
 from spike4dgs.benchmark.scene.training_bursts import open_bursts
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.checkpoint import load_checkpoint
-from spike4dgs.method.image_network.config import TINY, ImageTraining
+from spike4dgs.method.image_network.config import INPUTS, MOVING_LOSS, TINY, ImageTraining
 from spike4dgs.method.image_network.inputs import BESIDE, image_inputs
 from spike4dgs.method.image_network.maker import reconstruct
 from spike4dgs.method.image_network.network import ImageNetwork, log_mse, rate_of
@@ -92,6 +93,25 @@ def test_spikes_are_corrected_for_a_known_sensitivity_and_a_dead_pixel_is_silent
         torch.testing.assert_close(network(channels, spikes), network(halved, spikes / 2))
         channels[:, 6] = -1.0
         torch.testing.assert_close(network(channels, spikes), network(halved, spikes * 0))
+
+
+@pytest.mark.parametrize("part", [*INPUTS])
+def test_a_network_without_an_input_does_not_depend_on_it(part: str) -> None:
+    network = ImageNetwork(replace(TINY, without=part)).eval()
+    torch.nn.init.normal_(network.change.weight)
+    draws = torch.Generator().manual_seed(0)
+    channels, spikes = (torch.rand(1, n, 8, 8, generator=draws) for n in (8, 41))
+    channels[:, 6] = 0  # of a usual pixel: spikes are divided by it
+    first, last = INPUTS[part]
+    changed = channels.clone(), spikes.clone()
+    if part == "spikes":
+        changed[1].fill_(1.0)
+    else:
+        changed[0][:, max(first, 7 if part == "sensor" else 0) : last + 1] += 1
+    with torch.no_grad():
+        torch.testing.assert_close(network(*changed), network(channels, spikes), rtol=0, atol=0)
+        network.config = TINY
+        assert not torch.equal(network(*changed), network(channels, spikes))
 
 
 def test_losses_are_psnr_but_for_sign_and_factor() -> None:
@@ -201,6 +221,18 @@ def test_a_training_begins_with_given_weights_and_their_shards(tmp_path: Path, f
     run(training, training_key(TINY, SETTINGS, 0, "sha"), tmp_path / "on")
     assert len(WEIGHTS.read_card(tmp_path / "on" / "images.safetensors").trained_on) == 2
     assert training_key(TINY, SETTINGS, 0, "sha") != training_key(TINY, SETTINGS, 0)
+
+
+def test_without_the_moving_loss_what_moves_counts_as_the_rest(files) -> None:  # type: ignore[no-untyped-def]
+    batch = draw(files, SETTINGS, np.random.default_rng(0))
+    steps = {}
+    for moving in (batch.moving, ~batch.moving):
+        for without in ("", MOVING_LOSS):
+            training = ImageNetworkTraining(files, replace(TINY, without=without), SETTINGS, "cpu", 0)
+            training.train_step(replace(batch, moving=moving))
+            steps[bool(moving is batch.moving), without] = training.network.change.weight.detach().clone()
+    assert torch.equal(steps[True, MOVING_LOSS], steps[False, MOVING_LOSS])
+    assert not torch.equal(steps[True, ""], steps[False, ""])
 
 
 def test_scores_of_an_untrained_network_are_adaptives(tmp_path: Path) -> None:
