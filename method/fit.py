@@ -33,6 +33,7 @@ from spike4dgs.method.pace import at_pace
 from spike4dgs.method.pose_refinement import REFINEMENT
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.self_calibration.from_clip import as_in_clip
+from spike4dgs.method.self_calibration.shading import with_shadings
 from spike4dgs.method.settings import FLAT_FIELD, Settings, SettingsByPart, as_dict, follow_images, override, scaled
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest, at_most, measure
 from spike4dgs.method.supervision.base import Supervision
@@ -40,7 +41,7 @@ from spike4dgs.method.torch_state import check_device, kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 from spike4dgs.method.training_views.training_images import TrainingImages
-from spike4dgs.method.training_views.warm_up_scene import warm_up_scene
+from spike4dgs.method.training_views.warm_up_scene import short, warm_up_scene
 from spike4dgs.method.tuned import is_tuned
 
 T = TypeVar("T")
@@ -74,6 +75,7 @@ class Algorithm:
     published: Mapping[str, Any] = field(default_factory=dict)  # overrides of the settings
     supervisions: tuple[str, ...] = ()
     calibrated: bool = False  # its loss compares with spikes of the cameras' calibrated response
+    shaded: bool = False  # its loss takes the shadings that the clip tells
     rasterizes: bool = True  # renders Gaussians, which on CUDA needs numba-cuda
     refines: bool = True  # its models have `refine`
     layers: bool = False  # it knows `TrainingImages.light`: its gray is the first channel
@@ -159,6 +161,8 @@ class RecipeMethod(Shown):
         straight, own = as_pinholes(scene), settings["initialization"]
         start = self.initialization.start(StartRequest(straight, request.seed, own, request.device, recorded))
         start = replace(start, cameras=with_lenses(straight, start.cameras))
+        if self.algorithm.shaded:
+            scene = with_shadings(scene, start)
         return self._fit(scene, start, settings, request, recorded)
 
     def warm_up(self, request: FitRequest) -> None:
@@ -215,18 +219,10 @@ class RecipeMethod(Shown):
         """Return the settings with the step counts of a request's budget."""
         if not request.budget.published:
             return scaled(self.settings, request.budget.scale)
-        where = f"recipe {self.name}"
         if not (steps := self.algorithm.published):
-            raise problem(where, "a publication's step counts for --budget paper", "none", "choose another budget")
-        return override(self.settings, steps, where)
-
-
-def short(settings: SettingsByPart) -> dict[str, Settings]:
-    """Return settings with three images of each view of the made scene, and a step or a few in each stage."""
-    parts: Mapping[str, Any] = settings
-    own = {"in_pace": False} if hasattr(parts["motion"], "in_pace") else {}  # few images are far apart
-    few = {"images": replace(parts["images"], time_spacing_ticks=30), "motion": replace(parts["motion"], **own)}
-    return scaled({**parts, **few}, 0.005)
+            expected = "a publication's step counts for --budget paper"
+            raise problem(f"recipe {self.name}", expected, "none", "choose another budget")
+        return override(self.settings, steps, f"recipe {self.name}")
 
 
 def describe(recipe: Recipe, parts: Parts, algorithm: Algorithm) -> str:
@@ -259,8 +255,8 @@ def trainer_algorithm(recipe: Recipe, parts: Parts) -> Algorithm:
     def fit(job: FitJob) -> FittedModel:
         return fit_gaussians(job, MotionSpec(recipe.motion, job.extent, job.settings["motion"]), motion, supervision)
 
-    gray = motion.image is Motion.image
-    return Algorithm(motion.label, settings, fit, motion.published, calibrated=supervision.calibrated, layers=gray)
+    takes = {"calibrated": supervision.calibrated, "shaded": supervision.shaded}
+    return Algorithm(motion.label, settings, fit, motion.published, **takes, layers=motion.image is Motion.image)
 
 
 def fit_gaussians(

@@ -8,8 +8,8 @@ recordings, images are scored a second time, corrected by them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,10 @@ from spike4dgs.benchmark.scene.calibration import Calibration, estimate
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.self_calibration.clocks import with_camera
+from spike4dgs.method.self_calibration.shading import with_shadings
+from spike4dgs.method.starts.rig import rig
+from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 from spike4dgs.studies.kit.timing import by_turns_ms, show_table
 from spike4dgs.studies.speed_error.images import fired_stream, held_out
 
@@ -133,6 +137,18 @@ def middle_target(scene: Scene) -> Target:
     if not scene.targets:
         raise problem(scene.root, "a scene with targets", "none in targets.json", "use a scene that has ground truth")
     return scene.targets[len(scene.targets) // 2]
+
+
+@lru_cache(maxsize=1)
+def told(scene: Scene) -> dict[str, Calibration]:
+    """Return what all cameras' clips tell, at the given poses, of the held-out cameras: smooth shadings, if any."""
+    seen = replace(scene.training, recordings=())
+    for camera in scene.test:
+        seen = with_camera(seen, scene.cameras[camera], scene.stream(camera), None)
+    start = rig(as_pinholes(seen))
+    shaded = with_shadings(seen, replace(start, cameras=with_lenses(as_pinholes(seen), start.cameras)))
+    found = {camera: shaded.state(camera).shading for camera in scene.test}
+    return {c: Calibration.of_shading(s, scene.radiance_gain) for c, s in found.items() if s is not None}
 
 
 def calibrations(scene: Scene) -> dict[str, Calibration]:

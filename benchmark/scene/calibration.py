@@ -63,16 +63,22 @@ def find_recordings(meta: Mapping[str, Any], files: Manifest, camera: str, size:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Shown):
-    """A camera's response to light, as estimated from its recordings."""
+    """A camera's response to light, as estimated from its recordings, or what a clip tells of it."""
 
     gain: Float32  # [H, W] relative sensitivity, mean 1
     dark: Float32  # [H, W] spikes per tick in the dark
     radiance_gain: float  # spikes per tick of a pixel of gain 1 at radiance 1, without the dark rate
+    of_pixels: bool = True  # False: a smooth shading alone, as a clip tells it
 
     def _about(self) -> str:
         height, width = self.gain.shape
         dead = int((self.gain <= 0).sum())
         return f"of a camera: {width}x{height} pixels, {dead} dead, {self.radiance_gain:.4g} spikes per tick of white"
+
+    @staticmethod
+    def of_shading(shading: Float32, radiance_gain: float) -> Calibration:
+        """Return what is known of a camera's response where only its smooth shading [H, W] is."""
+        return Calibration(shading, np.zeros_like(shading), radiance_gain, of_pixels=False)
 
     def in_dark_of(self, scale: float) -> Calibration:
         """Return the response with dark rates `scale` times as high: itself for 1."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from spike4dgs.benchmark.arrays import Mask
+from spike4dgs.benchmark.arrays import Float32, Mask
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class CameraState:
     clock: Clock = Clock()
     gain: float = 1.0  # spikes per light, relative to the array's `radiance_gain`; beside any flat field
     dark: float = 1.0  # dark rates, relative to those of the recordings
+    shading: Float32 | None = None  # [H, W] relative sensitivity, smooth, mean 1, of a camera without recordings
     bad: Mask | None = None  # [H, W], pixels whose spikes say nothing; None: no such pixel is known
 
 

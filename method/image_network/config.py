@@ -28,9 +28,8 @@ MOVING_LOSS = "moving-loss"  # the second term of the loss, of where things move
 
 IMAGES = ImageConfig()
 TINY = ImageConfig("images-tiny", (4, 6, 8), 1)  # for tests
-HALF = ImageConfig("images-half", (16, 32, 48))  # for ablations, which a CPU trains
-ABLATIONS = tuple(replace(HALF, name=f"{HALF.name}-without-{part}", without=part) for part in (*INPUTS, MOVING_LOSS))
-CONFIGS = {config.name: config for config in (IMAGES, TINY, HALF, *ABLATIONS)}
+ABLATIONS = tuple(replace(IMAGES, name=f"images-without-{part}", without=part) for part in (*INPUTS, MOVING_LOSS))
+CONFIGS = {config.name: config for config in (IMAGES, TINY, *ABLATIONS)}
 
 
 @dataclass(frozen=True)

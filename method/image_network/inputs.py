@@ -38,10 +38,11 @@ class ImageInputs:
     unit: float  # spikes per tick, whose root is the unit of the channels' roots
 
 
-def image_inputs(stream: SpikeStream, tick: int, sensor: Maps | None = None) -> ImageInputs:
+def image_inputs(stream: SpikeStream, tick: int, sensor: Maps | None = None, of_pixels: bool = True) -> ImageInputs:
     """Return the inputs at the start of `tick`; `sensor` is relative sensitivity and dark rate, None if unknown.
 
-    Beyond its ends the clip is mirrored.
+    Where it is not known `of_pixels`, it corrects the images, but the network takes it as unknown. Beyond its ends the
+    clip is mirrored.
     """
     windows = rates_over_windows(stream, tick, sensor)
     roots = windows.roots()
@@ -51,7 +52,7 @@ def image_inputs(stream: SpikeStream, tick: int, sensor: Maps | None = None) -> 
         for d in (-BESIDE, BESIDE)
     ]
     known = np.zeros((2, stream.height, stream.width), np.float32)
-    if sensor:
+    if sensor and of_pixels:
         known[0], known[1] = sensor[0] - 1, 1
     channels = [roots[0], windows.log_length, roots[1], roots[2], *beside, *known]
     return ImageInputs(np.stack(channels).astype(np.float32), window(stream, tick), windows.mean)

@@ -37,7 +37,8 @@ def reconstruct(network: ImageNetwork, stream: SpikeStream, tick: int, camera: C
     from spike4dgs.method.msdi.network import has_bfloat16
 
     device = next(network.parameters()).device
-    found = image_inputs(stream, tick, (camera.gain, camera.dark) if camera else None)
+    of_pixels = camera is None or camera.of_pixels
+    found = image_inputs(stream, tick, (camera.gain, camera.dark) if camera else None, of_pixels)
     with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=has_bfloat16(device)):
         channels, spikes = (torch.from_numpy(a).to(device)[None] for a in (found.channels, found.spikes))
         rate = rate_of(network(channels, spikes)[0], found.unit).cpu().numpy()

@@ -35,6 +35,7 @@ class Supervision(nn.Module):
 
     label: ClassVar[str | None] = None  # in descriptions of recipes; None: the name
     calibrated: ClassVar[bool] = False  # compares with spikes of the cameras' calibrated response
+    shaded: ClassVar[bool] = False  # takes the shadings that the clip tells
     defaults: ClassVar[Settings] = Settings()  # of the supervision's own settings
 
     def forward(self, render: Render, sample: Sample) -> Tensor:

@@ -10,23 +10,19 @@ For each pixel, r and i are the means of R and I over the steps that saw it, old
 
     i - r = r (s + l) + m + e + noise,   γ = s + l,   d = m + e
 
-    s: shading, a sum of smooth cosines B a over the chip    a ~ N(0, S)
+    s: shading, smooth over the chip, told before the fit by points that views share (`self_calibration.shading`)
     l: the pixel's own gain                                  l ~ N(0, σ_l²)
     m: the typical dark level, a constant;  e: the pixel's own    e ~ N(0, σ_d²)
     noise: what the model still gets wrong there             N(0, σ_n²)
 
 σ_n² is σ_0², and by how much the mean of u² (below) over a square around the pixel exceeds what patterns explain:
-patterns are the same everywhere, but edges, and what moves before the fit has followed it, are not. Two rounds.
+patterns are the same everywhere, but edges, and what moves before the fit has followed it, are not.
 
 With v = σ_l² r² + σ_d² + σ_n² the most probable maps are
 
-    a = (Bᵀ W B + 1/S)⁻¹ Bᵀ w (i - r - m),   W = r²/v,  w = r/v    of each camera,
     l = σ_l² r u / v,   e = σ_d² u / v,   u = i - r - m - r s      of each pixel.
 
-(The weighted ridge regression of all unknowns at once, with l and e eliminated.) The mean of γ over a camera is 0, as
-the overall gain is the scene's; and so is the mean of a over the cameras. For a pattern that all cameras have in
-common, at the pixels that see one point, is a texture of the scene as well; only parallax and motion could tell. Left
-free it drifts, and the scene with it.
+The mean of γ over a camera is 0, as the overall gain is the scene's.
 
 Least squares of i on r over time could tell gain from dark where light changes, but moving edges that are rendered a
 little late would lower all such gains; means over time do not see that.
@@ -37,6 +33,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -46,8 +43,6 @@ from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.method.supervision.base import Render, Sample, Supervision, difference
 from spike4dgs.method.supervision.pixel import PixelSettings
 
-_ROUNDS = 2  # of shading, and the noise that it leaves
-
 
 @dataclass(frozen=True)
 class FixedPatternSettings(PixelSettings):
@@ -56,8 +51,6 @@ class FixedPatternSettings(PixelSettings):
     The spreads are those of a real 250x400 spike camera, as published; `spikes.sensor_model` has the source of each.
     """
 
-    shading: float = math.sqrt(SENSOR.gain_spread**2 - SENSOR.gain_local_spread**2)  # relative, standard deviation
-    shading_order: int = 3  # half waves over the chip, of both directions together
     pixel_gain: float = SENSOR.gain_local_spread  # σ_l
     dark: float = SENSOR.dark_median * math.exp(SENSOR.dark_log_spread**2 / 2)  # m: mean of the log-normal, spikes/tick
     # σ_d, that of the log-normal, in spikes per tick
@@ -75,6 +68,8 @@ class FixedPattern(Supervision):
 
     label = "the cameras' fixed patterns estimated from the clip"
     defaults = FixedPatternSettings()
+    shaded = True
+    shading: Tensor  # s [C, H, W]
     gain: Tensor  # γ [C, H, W]
     dark: Tensor  # d [C, H, W], in white
     sums: Tensor  # [3, C, H, W], weighted: of steps, of R and of I
@@ -84,7 +79,11 @@ class FixedPattern(Supervision):
         self.settings, self.white = settings, scene.radiance_gain
         camera = scene.cameras[0]
         size = len(scene.cameras), camera.height, camera.width
-        self.register_buffer("gain", torch.zeros(size))
+        told = [scene.state(c.id).shading for c in scene.cameras]
+        flat = np.ones(size[1:], np.float32)
+        shading = np.stack([flat if found is None else found for found in told]) - 1
+        self.register_buffer("shading", torch.from_numpy(shading), persistent=False)  # a scene tells it again
+        self.register_buffer("gain", torch.from_numpy(shading.copy()))
         self.register_buffer("dark", torch.full(size, settings.dark / self.white))
         self.register_buffer("sums", torch.zeros(3, *size))
 
@@ -94,7 +93,7 @@ class FixedPattern(Supervision):
         self._remember(rendered.detach(), sample)
         s = self.settings
         if sample.step >= s.first and sample.step % s.every == 0:
-            self.gain, self.dark = solve(self.sums, s, self.white)
+            self.gain, self.dark = solve(self.sums, self.shading, s, self.white)
         response = rendered * (1 + self.gain[chosen]) + self.dark[chosen]
         return difference(response, sample.images, s.ssim_weight, s.huber_delta)
 
@@ -109,45 +108,19 @@ class FixedPattern(Supervision):
         self.sums[:, chosen] = self.sums[:, chosen] * kept + torch.where(seen, new, 0.0)
 
 
-def solve(sums: Tensor, s: FixedPatternSettings, white: float) -> tuple[Tensor, Tensor]:
+def solve(sums: Tensor, shading: Tensor, s: FixedPatternSettings, white: float) -> tuple[Tensor, Tensor]:
     """Return the most probable gain γ and dark level d, [C, H, W] each, from sums [3, C, H, W]; see the module.
 
-    `white` is spikes per tick of white.
+    `shading` is s [C, H, W], `white` spikes per tick of white.
     """
     count, light, measured = sums
     seen = count > 0
     r, i = (torch.where(seen, total / count.clamp(min=1e-6), 0.0) for total in (light, measured))
     own_gain, own_dark = s.pixel_gain**2 * r * r, (s.dark_spread / white) ** 2
-    left, noise = torch.where(seen, i - r - s.dark / white, 0.0), torch.full_like(r, s.model_error**2)
-    basis, spread = shading_basis(r.shape[1], r.shape[2], s, r.device)
-    for _ in range(_ROUNDS):
-        variance = own_gain + own_dark + noise
-        shading = _shading(r, left, variance, basis, spread)
-        own = torch.where(seen, left - r * shading, 0.0)
-        excess = (own.square() - own_gain - own_dark) * seen
-        around = [avg_pool2d(x.to(r), s.noise_px, 1, s.noise_px // 2) for x in (excess, seen)]
-        noise = s.model_error**2 + (around[0] / around[1].clamp(min=1e-6)).clamp(min=0)
+    own = torch.where(seen, i - r - s.dark / white - r * shading, 0.0)
+    excess = (own.square() - own_gain - own_dark) * seen
+    around = [avg_pool2d(x.to(r), s.noise_px, 1, s.noise_px // 2) for x in (excess, seen)]
+    noise = s.model_error**2 + (around[0] / around[1].clamp(min=1e-6)).clamp(min=0)
+    variance = own_gain + own_dark + noise
     gain = shading + s.pixel_gain**2 * r * own / variance
     return gain - gain.mean((1, 2), keepdim=True), s.dark / white + own_dark * own / variance
-
-
-def _shading(r: Tensor, left: Tensor, variance: Tensor, basis: Tensor, spread: Tensor) -> Tensor:
-    """Return s [C, H, W], less what it is in the mean of the cameras."""
-    weighted = basis * (r * r / variance).flatten(1)[:, None]  # [C, M, H * W]
-    normal = weighted @ basis.T + torch.diag(spread**-2)
-    a = torch.linalg.solve(normal, (r * left / variance).flatten(1) @ basis.T)  # [C, M]
-    return ((a - a.mean(0)) @ basis).reshape(r.shape)
-
-
-def shading_basis(height: int, width: int, s: FixedPatternSettings, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the smooth cosines [M, H * W] and the standard deviation [M] of their coefficients.
-
-    cos(i y) cos(j x), with 0 < i + j <= `shading_order`, x and y from 0 to pi over the chip. All are equally likely,
-    and their sum varies by `shading`.
-    """
-    x, y = ((torch.arange(n, device=device) + 0.5) * (math.pi / n) for n in (width, height))
-    orders = [(i, j) for i in range(s.shading_order + 1) for j in range(s.shading_order + 1 - i) if i + j]
-    waves = [torch.outer((i * y).cos(), (j * x).cos()).flatten() for i, j in orders]
-    basis = torch.stack(waves) if waves else x.new_zeros(0, height * width)
-    total = basis.square().mean(1).sum().sqrt()
-    return basis, torch.full((len(basis),), s.shading, device=device) / total

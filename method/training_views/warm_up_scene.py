@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +13,7 @@ from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.method.settings import Settings, SettingsByPart, scaled
 
 _WIDTH, _HEIGHT, _TICKS = 64, 40, 81  # as small as the smallest profile
 _RATE_HZ, _GAIN = 20_000.0, 0.6
@@ -33,6 +38,14 @@ def warm_up_scene() -> tuple[TrainingScene, NDArray[np.float32], NDArray[np.floa
     y, x = np.mgrid[-1:1:12j, -1.6:1.6:20j].reshape(2, -1)
     points = np.stack([x, y, np.full_like(x, _DISTANCE_M)], axis=1).astype(np.float32)
     return scene, points, _texture(x, y).astype(np.float32)
+
+
+def short(settings: SettingsByPart) -> dict[str, Settings]:
+    """Return settings with three images of each view of the made scene, and a step or a few in each stage."""
+    parts: Mapping[str, Any] = settings
+    own = {"in_pace": False} if hasattr(parts["motion"], "in_pace") else {}  # few images are far apart
+    few = {"images": replace(parts["images"], time_spacing_ticks=30), "motion": replace(parts["motion"], **own)}
+    return scaled({**parts, **few}, 0.005)
 
 
 def _texture(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:

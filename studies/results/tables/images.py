@@ -1,6 +1,7 @@
 """Table 6 of the paper: every image maker on the held-out cameras' own spikes. Nothing is fitted.
 
-Rows are MAKER.images, and MAKER+rig-flat.images where the camera's calibration corrects the images.
+Rows are MAKER.images, MAKER+shading.images where the shading that the array's clips tell corrects the images, and
+MAKER+rig-flat.images where the camera's calibration does.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from spike4dgs.baselines.images.published.makers import MAKERS as PUBLISHED
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.weights import WeightsError
-from spike4dgs.studies.images import TABLE_6, calibrations, middle_target, score_maker
+from spike4dgs.studies.images import TABLE_6, calibrations, middle_target, score_maker, told
 from spike4dgs.studies.kit.timing import by_turns_ms, markdown
 from spike4dgs.studies.results.blocks import NOTHING, both_text, of_group, provenance
 from spike4dgs.studies.results.comparison import MeasuredRow, rows_of
@@ -20,7 +21,8 @@ from spike4dgs.studies.results.plan import CALIBRATED, NOT_TUNED, OUR_TRIALS, TA
 from spike4dgs.studies.results.records import COSTS, Record, short
 from spike4dgs.studies.speed_error.images import held_out
 
-SUFFIX, CORRECTED = ".images", "+rig-flat"
+SUFFIX, CORRECTED, SHADED = ".images", "+rig-flat", "+shading"
+_CAMERAS = {"": lambda scene: {}, SHADED: told, CORRECTED: calibrations}  # of held-out cameras, what a row knows
 _METRICS = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")
 _REPEATS = 5  # the median of so many images is the time
 _TUNED_ON = {
@@ -37,18 +39,20 @@ TABLE6 = Group(
     "table6",
     "Table 6: images from spikes",
     (*TABLE1.scenes, *TABLE2.scenes),
-    tuple(_row(maker, knows) for maker in IMAGES for knows in ("", CORRECTED)),
+    tuple(_row(maker, knows) for maker in IMAGES for knows in _CAMERAS),
 )
 
 
 def measure_images(row: str, scene: Scene) -> Record:
     """Return the part of a record that the images of a row tell: knowledge, metrics, images per second."""
-    corrected = row.endswith(f"{CORRECTED}{SUFFIX}")
-    maker = IMAGES[row.removesuffix(SUFFIX).removesuffix(CORRECTED)]
-    part: Record = {"knowledge": CALIBRATED if corrected else UNCALIBRATED, "metrics": {}, **dict.fromkeys(COSTS)}
-    cameras = calibrations(scene) if corrected else {}
-    if corrected and len(cameras) < len(scene.test):
-        return {**part, "error": "skipped: no calibration recordings of a held-out camera"}
+    name = row.removesuffix(SUFFIX)
+    knows = next((knows for knows in (SHADED, CORRECTED) if name.endswith(knows)), "")
+    maker, knowledge = IMAGES[name.removesuffix(knows)], CALIBRATED if knows == CORRECTED else UNCALIBRATED
+    part: Record = {"knowledge": knowledge, "metrics": {}, **dict.fromkeys(COSTS)}
+    cameras = _CAMERAS[knows](scene)
+    if knows and len(cameras) < len(scene.test):
+        lacking = "no calibration recordings" if knows == CORRECTED else "the clips tell no shading"
+        return {**part, "error": f"skipped: {lacking} of a held-out camera"}
     try:
         scores = score_maker(maker, scene, cameras, _METRICS)
     except WeightsError as e:
@@ -63,23 +67,23 @@ def images_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of table 6: each maker's images as they are and corrected, best first, and the paper's."""
     own = of_group(TABLE6, records)
     known = {row.name: row for row in rows_of([row.name for row in TABLE6.rows], TABLE6.scenes, own)}
-    pairs = {maker: (known[f"{maker}{SUFFIX}"], known[f"{maker}{CORRECTED}{SUFFIX}"]) for maker in IMAGES}
-    measured = [maker for maker, (plain, _) in pairs.items() if plain.is_complete]
+    rows = {maker: tuple(known[f"{maker}{knows}{SUFFIX}"] for knows in _CAMERAS) for maker in IMAGES}
+    measured = [maker for maker, (plain, *_) in rows.items() if plain.is_complete]
     if not measured:
         return [NOTHING]
-    measured.sort(key=lambda maker: -(pairs[maker][0].mean("psnr") or 0.0))
+    measured.sort(key=lambda maker: -(rows[maker][0].mean("psnr") or 0.0))
     lines = [
-        [f"`{maker}`", _ms(plain), *_scores(plain), *_scores(corrected), *_printed(maker)]
+        [f"`{maker}`", _ms(rows[maker][0]), *(s for row in rows[maker] for s in _scores(row)), *_printed(maker)]
         for maker in measured
-        for plain, corrected in [pairs[maker]]
     ]
-    scores = ("PSNR / moving", "SSIM", "corrected: PSNR / moving", "SSIM")
+    scores = ("PSNR / moving", "SSIM", "shading: PSNR / moving", "SSIM", "corrected: PSNR / moving", "SSIM")
     heads = ("images", "ms", *scores, "in table 6", "published PSNR / SSIM")
     legend = (
         f"Means of {len(TABLE6.scenes)} scenes; milliseconds an image of 200x125, in parentheses those measured beside "
-        "other programs. Corrected images know the camera's flat field and dark recording."
+        "other programs. Shading: corrected by the smooth shading that the array's clips tell, at the given poses. "
+        "Corrected images know the camera's flat field and dark recording."
     )
-    text = _agreement({maker: pairs[maker][0] for maker in measured}) + legend
+    text = _agreement({maker: rows[maker][0] for maker in measured}) + legend
     return [*markdown(heads, lines), "", text, "", provenance(own, TABLE6)]
 
 

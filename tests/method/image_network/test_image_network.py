@@ -12,6 +12,7 @@ from safetensors.torch import load_file
 from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
 
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.training_bursts import open_bursts
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.checkpoint import load_checkpoint
@@ -56,6 +57,19 @@ def test_inputs_are_adaptive_images_in_roots_of_the_clips_mean() -> None:
 def test_a_sensor_that_is_not_known_leaves_its_channels_at_nothing() -> None:
     found = image_inputs(_stream(), 50)
     assert not found.channels[6:].any()
+
+
+def test_a_shading_alone_corrects_the_images_of_a_sensor_that_is_not_known() -> None:
+    stream, shading = _stream(), np.linspace(0.8, 1.2, 140, dtype=np.float32).reshape(10, 14)
+    sensor = shading, np.zeros_like(shading)
+    found, known = image_inputs(stream, 50, sensor, of_pixels=False), image_inputs(stream, 50, sensor)
+    np.testing.assert_array_equal(found.channels[:6], known.channels[:6])
+    assert not found.channels[6:].any() and known.channels[7].all()
+    network = ImageNetwork(TINY).eval()
+    torch.nn.init.normal_(network.change.weight)
+    told = reconstruct(network, stream, 50, Calibration.of_shading(shading, 0.6))
+    assert not np.array_equal(told, reconstruct(network, stream, 50, Calibration(*sensor, 0.6)))
+    assert not np.array_equal(told, reconstruct(network, stream, 50))
 
 
 def test_ends_of_the_clip_have_inputs_of_the_ticks_that_are_there() -> None:

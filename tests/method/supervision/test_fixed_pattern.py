@@ -7,8 +7,9 @@ import pytest
 import torch
 from toy_world import ToyWorld
 
+from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.method.supervision.base import Sample, difference
-from spike4dgs.method.supervision.fixed_pattern import FixedPattern, FixedPatternSettings, shading_basis, solve
+from spike4dgs.method.supervision.fixed_pattern import FixedPattern, FixedPatternSettings, solve
 from spike4dgs.method.supervision.table import SUPERVISIONS
 
 WORLD = ToyWorld(width=32, height=20, side=2, n_ticks=120)
@@ -17,36 +18,25 @@ SETTINGS = FixedPatternSettings(first=0, every=1)
 VIEWS, SIZE = len(WORLD.training.cameras), (20, 32)
 
 
-def cosines(height: int, width: int, order: int) -> np.ndarray:
-    """Cosines [H, W, M], one at a time."""
-    y, x = np.mgrid[:height, :width]
-    pairs = [(i, j) for i in range(order + 1) for j in range(order + 1) if 0 < i + j <= order]
-    waves = [np.cos(i * np.pi * (y + 0.5) / height) * np.cos(j * np.pi * (x + 0.5) / width) for i, j in pairs]
-    return np.stack(waves, axis=-1) if waves else np.zeros((height, width, 0))
+def slope(height: int, width: int) -> np.ndarray:
+    """A wave [H, W] of half a period down the chip, with mean 0."""
+    return np.repeat(np.cos(np.pi * (np.arange(height) + 0.5) / height)[:, None], width, axis=1)
 
 
-def regression(r: np.ndarray, i: np.ndarray, s: FixedPatternSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Gain and dark level [C, H, W]: least squares in float64 for the shading, gain and dark of every pixel at once.
-
-    The shadings' mean is taken away, and gain and dark are found once more; then all that with the noise around pixels.
-    """
-    light, left = r.reshape(len(r), -1), (i - r - s.dark / WHITE).reshape(len(r), -1)
-    basis = cosines(*r.shape[1:], s.shading_order).reshape(light.shape[1], -1)
-    (n, m), own_dark = basis.shape, s.dark_spread / WHITE
-    spread = s.shading / np.sqrt((basis**2).mean(axis=0).sum()) if m else 1.0
-    noise = np.full(r.shape, s.model_error**2)
-    for _ in range(2):
-        deviation = np.sqrt(noise.reshape(len(r), -1))
-        columns = [np.concatenate([a[:, None] * basis, np.diag(a), np.eye(n)], axis=1) for a in light]
-        prior = 1 / np.repeat([spread, s.pixel_gain, own_dark], [m, n, n])
-        waves = np.stack([ridge(x, y, e, prior)[:m] for x, y, e in zip(columns, left, deviation, strict=True)])
-        shading = (waves - waves.mean(axis=0)) @ basis.T
-        u = left - light * shading
-        own = np.stack([ridge(x[:, m:], y, e, prior[m:]) for x, y, e in zip(columns, u, deviation, strict=True)])
-        excess = (u**2 - (s.pixel_gain * light) ** 2 - own_dark**2).reshape(r.shape)
-        noise = s.model_error**2 + np.maximum(around(excess, s.noise_px // 2), 0)
-    gain = shading + own[:, :n]
-    return (gain - gain.mean(axis=1, keepdims=True)).reshape(r.shape), s.dark / WHITE + own[:, n:].reshape(r.shape)
+def regression(
+    r: np.ndarray, i: np.ndarray, shading: np.ndarray, s: FixedPatternSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gain and dark level [C, H, W]: least squares in float64 for gain and dark of every pixel at once."""
+    light, own_dark = r.reshape(len(r), -1), s.dark_spread / WHITE
+    u, n = (i - r - s.dark / WHITE - r * shading).reshape(len(r), -1), light.shape[1]
+    excess = (u**2 - (s.pixel_gain * light) ** 2 - own_dark**2).reshape(r.shape)
+    noise = s.model_error**2 + np.maximum(around(excess, s.noise_px // 2), 0)
+    prior = 1 / np.repeat([s.pixel_gain, own_dark], n)
+    columns = [np.concatenate([np.diag(a), np.eye(n)], axis=1) for a in light]
+    deviation = np.sqrt(noise.reshape(len(r), -1))
+    own = np.stack([ridge(x, y, e, prior) for x, y, e in zip(columns, u, deviation, strict=True)])
+    gain = shading + own[:, :n].reshape(r.shape)
+    return gain - gain.mean(axis=(1, 2), keepdims=True), s.dark / WHITE + own[:, n:].reshape(r.shape)
 
 
 def ridge(columns: np.ndarray, values: np.ndarray, deviation: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -67,9 +57,9 @@ def around(images: np.ndarray, reach: int) -> np.ndarray:
     "light, settings",
     [
         ((0.0, 1.0), SETTINGS),
-        ((0.2, 0.6), replace(SETTINGS, shading_order=1, model_error=0.1, noise_px=3)),
+        ((0.2, 0.6), replace(SETTINGS, model_error=0.1, noise_px=3)),
         ((0.0, 1e-4), SETTINGS),  # the dark: nothing tells a gain
-        ((0.9, 30.0), replace(SETTINGS, shading_order=0, model_error=1e-3)),  # far brighter than white
+        ((0.9, 30.0), replace(SETTINGS, model_error=1e-3)),  # far brighter than white
     ],
 )
 def test_maps_are_those_of_ridge_regression(light: tuple[float, float], settings: FixedPatternSettings) -> None:
@@ -79,29 +69,31 @@ def test_maps_are_those_of_ridge_regression(light: tuple[float, float], settings
     i[:, 2:5, 3:6] += 0.3 * rng.random((2, 3, 3))  # what no pattern explains
     count = torch.from_numpy(rng.uniform(0.5, 20, r.shape))
     sums = torch.stack([count, count * torch.from_numpy(r), count * torch.from_numpy(i)])
-    gain, dark = solve(sums.float(), settings, WHITE)
-    for found, expected in zip((gain, dark), regression(r, i, settings), strict=True):
+    shading = 0.08 * rng.standard_normal(r.shape)
+    gain, dark = solve(sums.float(), torch.from_numpy(shading).float(), settings, WHITE)
+    for found, expected in zip((gain, dark), regression(r, i, shading, settings), strict=True):
         np.testing.assert_allclose(found.numpy(), expected, atol=2e-5)
 
 
-def test_a_pixel_that_was_never_seen_has_the_shading_around_it_and_the_typical_dark_level() -> None:
+def test_a_pixel_that_was_never_seen_has_the_shading_there_and_the_typical_dark_level() -> None:
     r, seen = torch.full((2, *SIZE), 0.5), torch.ones(2, *SIZE)
     seen[0, 3:6, 4:9] = 0
-    slope = cosines(*SIZE, 1)[..., 0] * 0.08
-    i = r * (1 + torch.from_numpy(np.stack([slope, -slope])).float()) + SETTINGS.dark / WHITE
-    gain, dark = solve(torch.stack([seen, seen * r, seen * i]), SETTINGS, WHITE)
+    shading = torch.from_numpy(np.stack([0.08 * slope(*SIZE), -0.08 * slope(*SIZE)])).float()
+    i = r * (1 + shading) + SETTINGS.dark / WHITE
+    gain, dark = solve(torch.stack([seen, seen * r, seen * i]), shading, SETTINGS, WHITE)
     hole = seen[0] == 0
-    np.testing.assert_allclose(gain[0][hole].numpy(), slope[hole.numpy()], atol=2e-3)
+    np.testing.assert_allclose(gain[0][hole].numpy(), shading[0][hole].numpy(), atol=1e-6)
     np.testing.assert_allclose(dark[0][hole].numpy(), SETTINGS.dark / WHITE, rtol=1e-6)
 
 
-def test_a_shading_that_all_cameras_share_is_left_to_the_scene() -> None:
-    r = torch.full((3, *SIZE), 0.5)
-    shared, own = 0.08 * cosines(*SIZE, 1)[..., 1], 0.04 * cosines(*SIZE, 1)[..., 0]
-    true = np.stack([shared + own, shared - own, shared])
-    i = r * (1 + torch.from_numpy(true).float()) + SETTINGS.dark / WHITE
-    gain, _ = solve(torch.stack([torch.ones_like(r), r, i]), replace(SETTINGS, pixel_gain=1e-6), WHITE)
-    np.testing.assert_allclose(gain.numpy(), true - shared, atol=2e-3)
+def test_the_loss_begins_with_the_shadings_of_the_scene() -> None:
+    told = (1 + 0.05 * slope(*SIZE)).astype(np.float32)
+    camera = WORLD.training.cameras[1].id
+    scene = replace(WORLD.training, states={camera: CameraState(shading=told)})
+    loss = SUPERVISIONS["fixed-pattern"](SETTINGS, scene)
+    found = loss.estimates()["gain"].numpy()
+    np.testing.assert_allclose(found[1], told, rtol=1e-6)
+    assert (found[0] == 1).all() and (found[2:] == 1).all()
 
 
 def loss_of(settings: FixedPatternSettings) -> FixedPattern:
@@ -115,10 +107,8 @@ def normal(rng: np.random.Generator, *shape: int) -> torch.Tensor:
 
 
 def patterns(rng: np.random.Generator, s: FixedPatternSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Gain and dark level [C, H, W] drawn from the prior; the cameras' shadings have the mean 0."""
-    basis, spread = shading_basis(*SIZE, s, torch.device("cpu"))
-    waves = normal(rng, VIEWS, len(basis)) * spread
-    gain = ((waves - waves.mean(0)) @ basis).reshape(VIEWS, *SIZE) + s.pixel_gain * normal(rng, VIEWS, *SIZE)
+    """Gain and dark level [C, H, W] drawn from the prior."""
+    gain = s.pixel_gain * normal(rng, VIEWS, *SIZE)
     dark = (s.dark + s.dark_spread * normal(rng, VIEWS, *SIZE)) / WHITE
     return gain - gain.mean((1, 2), keepdim=True), dark
 
@@ -143,7 +133,7 @@ def test_known_patterns_are_found_from_noisy_images_of_a_changing_scene() -> Non
         (s.pixel_gain**-2 + 0.7**2 / ((s.dark_spread / WHITE) ** 2 + s.model_error**2)) ** -0.5,
     )
     assert expected < float(found.std()) < 1.4 * expected  # the noise is measured, from 49 pixels
-    assert float(found.std()) < 0.3 * float(gain.std())
+    assert float(found.std()) < 0.6 * float(gain.std())
     assert float((loss.dark - dark).std()) < float(dark.std())
 
 

@@ -269,9 +269,10 @@ def test_a_method_of_ours_does_not_change_with_the_baselines() -> None:
 
 
 def test_images_are_measured_without_a_fit_and_corrected_where_the_camera_is_known(folder: Path) -> None:
-    outcome, records, _ = swept(folder, cells("tfp.images", "tfp+rig-flat.images"), {})
+    rows = ("tfp.images", "tfp+rig-flat.images", "tfp+shading.images")
+    outcome, records, _ = swept(folder, cells(*rows), {})
     assert (outcome.left, outcome.failed) == (0, ())
-    plain, corrected = sorted(records.values(), key=lambda r: r["knowledge"], reverse=True)
+    plain, corrected, shaded = (next(r for r in records.values() if r["row"] == row) for row in rows)
     scene = open_scene(folder / "pattern-0")
     pairs = [
         (scene.ground_truth(t), IMAGES["tfp"](scene.stream(t.camera), [t.tick], scene.radiance_gain)[0])
@@ -281,3 +282,5 @@ def test_images_are_measured_without_a_fit_and_corrected_where_the_camera_is_kno
     assert plain["metrics"]["psnr"] == pytest.approx(np.mean(expected), abs=1e-3) and plain["error"] is None
     assert plain["render_fps"] > 0 and plain["fit_seconds"] is None
     assert corrected["error"] == "skipped: no calibration recordings of a held-out camera" and not corrected["metrics"]
+    assert shaded["error"] == "skipped: the clips tell no shading of a held-out camera"
+    assert [r["knowledge"] for r in (plain, shaded, corrected)] == ["uncalibrated", "uncalibrated", "calibrated"]
