@@ -15,6 +15,11 @@ MEASUREMENTS: dict[str, Command] = {
         "estimate poses from less and less light: the matching network, SIFT and COLMAP on the same spikes",
         "report dark-poses data/matching --out runs/dark-poses",
     ),
+    "report dark-points": Command(
+        "spike4dgs.cli.studies:dark_points",
+        "find points from less and less light at true poses: the matching network's cost volume and the plane sweep",
+        "report dark-points data/matching --out runs/dark-points",
+    ),
     "report hard-cases": Command(
         "spike4dgs.cli.studies:hard_cases",
         "run hard inputs, seeds, interrupted fits and threads beside independent results, and write one page",

@@ -10,6 +10,7 @@ from spike4dgs.studies.oracle_ladder import oracle_ladder as oracle_ladder
 from spike4dgs.studies.patterns import patterns as patterns
 from spike4dgs.studies.poses.dark import dark_poses as dark_poses
 from spike4dgs.studies.poses.estimators import poses as poses
+from spike4dgs.studies.poses.points import dark_points as dark_points
 from spike4dgs.studies.realism.command import realism as realism
 from spike4dgs.studies.recorder import record as record
 from spike4dgs.studies.results.command import results as results

@@ -10,7 +10,7 @@ its rotations, and between its directions.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ LIGHTS = (1.0, 1 / 4, 1 / 16)
 TICKS = (41, 101, 401)  # 2, 5 and 20 ms
 VIEWS = 8
 ROTATION_DEG, DIRECTION_DEG = 1.0, 5.0  # a pair's bars
-_EXPOSURE = 0.25  # mean radiance of COLMAP's images
+EXPOSURE = 0.25  # mean radiance of COLMAP's images
 _NONE = 180.0  # degrees, of pairs without poses
 
 
@@ -71,21 +71,32 @@ def dark_poses(
         seed: Seed of the sensors' noise and of the estimators.
         out: Folder for the results.
     """
-    files = [f for f in open_folder(data) if f.facts.hidden and f.facts.resting and f.facts.views > VIEWS]
-    if not files:
-        fix = "make them with `spike4dgs make-msdi-data --resting 16`"
-        raise problem(data, f"shards of hidden variants with arrays of more than {VIEWS} views at rest", "none", fix)
     rows: list[dict[str, Any]] = []
-    start, arrays = time.perf_counter(), [(f, n) for f in files for n in _resting(f, bursts)]
-    for done, (file, number) in enumerate(arrays, start=1):
+    for file, number in with_progress(resting_arrays(data, bursts)):
         rows += _kept(file, number, seed, out / "arrays")
-        passed = time.perf_counter() - start
-        left = passed / done * (len(arrays) - done)
-        print(f"{file.facts.id}: {done}/{len(arrays)} arrays, {passed:.0f} s, about {left:.0f} s left", flush=True)
     about = {"commit": harness()["commit"], "cpu": cpu_name(), "command": command_line(), "seed": seed}
     write_json(out / "poses.json", {**about, "weights": WEIGHTS.in_use().sha256, "rows": rows})
     _write(rows, out)
     return 0
+
+
+def resting_arrays(data: Path, count: int) -> list[tuple[BurstFile, int]]:
+    """Return `count` arrays at rest of each shard of hidden variants. Raises UserError for a folder without any."""
+    files = [f for f in open_folder(data) if f.facts.hidden and f.facts.resting and f.facts.views > VIEWS]
+    if not files:
+        fix = "make them with `spike4dgs make-msdi-data --resting 16`"
+        raise problem(data, f"shards of hidden variants with arrays of more than {VIEWS} views at rest", "none", fix)
+    return [(file, number) for file in files for number in _resting(file, count)]
+
+
+def with_progress(arrays: Sequence[tuple[BurstFile, int]]) -> Iterator[tuple[BurstFile, int]]:
+    """Yield arrays, and print after each how many are done and how long the others will take."""
+    start = time.perf_counter()
+    for done, (file, number) in enumerate(arrays, start=1):
+        yield file, number
+        passed = time.perf_counter() - start
+        left = passed / done * (len(arrays) - done)
+        print(f"{file.facts.id}: {done}/{len(arrays)} arrays, {passed:.0f} s, about {left:.0f} s left", flush=True)
 
 
 def _resting(file: BurstFile, count: int) -> Sequence[int]:
@@ -167,7 +178,7 @@ def _solved(matches: Matches, sight: Sight, seed: int) -> tuple[Camera, ...]:
 def _colmap(images: Callable[[Sight], Float32]) -> Callable[[Sight, int], tuple[Camera, ...]]:
     def estimate(sight: Sight, seed: int) -> tuple[Camera, ...]:
         rates = images(sight)
-        exposed = rates * np.float32(_EXPOSURE / max(float(rates.mean()), 1e-6))
+        exposed = rates * np.float32(EXPOSURE / max(float(rates.mean()), 1e-6))
         return map_views(sight.cameras, exposed.astype(np.float32), seed).cameras
 
     return estimate
@@ -207,7 +218,8 @@ def _shares(rows: Sequence[Mapping[str, Any]], light: float, ticks: int, name: s
     return found[0], found[1]
 
 
-def _named(light: float) -> str:
+def named(light: float) -> str:
+    """Return a light as a fraction."""
     return f"1/{1 / light:.0f}" if light < 1 else "1"
 
 
@@ -218,7 +230,7 @@ def _write(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
     for light in LIGHTS:
         for ticks in TICKS:
             cells = [" / ".join(f"{share:.0f} %" for share in _shares(rows, light, ticks, name)) for name in ESTIMATORS]
-            table.append([_named(light), f"{ticks // 20}", *cells])
+            table.append([named(light), f"{ticks // 20}", *cells])
     write_csv(out / "poses.csv", columns, table)
     write_text(out / "poses.md", "\n".join([*markdown(columns, table), ""]))
     show_table("", columns, table, None)
@@ -228,7 +240,7 @@ def _write(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
         for name in ESTIMATORS:
             axes.plot(LIGHTS, [_shares(rows, light, ticks, name)[1] for light in LIGHTS], "o-", label=name)
         axes.set(xscale="log", title=f"{ticks // 20} ms", xlabel="light")
-        axes.set_xticks(LIGHTS, [_named(light) for light in LIGHTS])
+        axes.set_xticks(LIGHTS, [named(light) for light in LIGHTS])
         axes.minorticks_off()
     panels[0].set_ylabel(f"directions within {DIRECTION_DEG:.0f} degrees, %")
     panels[0].legend(fontsize=7)
