@@ -45,8 +45,9 @@ def train_msdi(
         data: Folder of shards; those of the hidden variants are only scored.
         out: Folder for all output.
         config: small, paper (a GPU's work), bottleneck (the network that matches views: of the other options it
-            takes data, out, start, steps and seed, and a larger --steps goes on where the training ended), or images
-            (the network that makes images: it takes data, out, start, steps, seed and device).
+            takes data, out, start, steps and seed, and a larger --steps goes on where the training ended), images
+            (the network that makes images: it takes data, out, start, steps, seed and device), or an ablation of it
+            (images-without-spikes, -error-bar, -windows, -beside, -sensor, or -moving-loss).
         start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file. The
             steps of bottleneck's weights count.
         steps: Steps.

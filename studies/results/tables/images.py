@@ -6,11 +6,12 @@ MAKER+rig-flat.images where the camera's calibration does.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from spike4dgs.baselines.images.published.makers import MAKERS as PUBLISHED
 from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.studies.images import TABLE_6, calibrations, middle_target, score_maker, told
@@ -22,7 +23,11 @@ from spike4dgs.studies.results.records import COSTS, Record, short
 from spike4dgs.studies.speed_error.images import held_out
 
 SUFFIX, CORRECTED, SHADED = ".images", "+rig-flat", "+shading"
-_CAMERAS = {"": lambda scene: {}, SHADED: told, CORRECTED: calibrations}  # of held-out cameras, what a row knows
+_CAMERAS: Mapping[str, Callable[[Scene], dict[str, Calibration]]] = {  # of held-out cameras, what a row knows
+    "": lambda scene: {},
+    SHADED: told,
+    CORRECTED: calibrations,
+}
 _METRICS = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")
 _REPEATS = 5  # the median of so many images is the time
 _TUNED_ON = {
