@@ -144,40 +144,6 @@ def test_kernels_serve_all_lists_of_pixels_and_numbers_of_samples(r):
     assert launched and all(kernel["cache_hit"] for kernel in launched)
 
 
-@pytest.mark.parametrize("world", ["turntable", "bird", "bricks"])  # rigid; smooth and bending; flat and in pieces
-def test_recorded_launches_are_those_that_are_traced_anew(world):
-    """What a record keeps of the scene, such as the addresses of vertices, has to follow the motion."""
-    import drjit as dr
-
-    if load_mitsuba().variant() != "llvm_ad_rgb":
-        pytest.skip("other variants record nothing")
-    lens = [replace(c, distortion=(-0.1, 0.01, 0.0, 0.0, 0.0)) for c in cameras(built(world), WIDTH, HEIGHT, (1, 4))]
-    own = SplitRenderer(built(world), lens, seed=0, spp=SPP, background_spp=2 * SPP, soft=SOFT, psf_px=0.4)
-
-    def launched(where: np.ndarray, maps: list) -> list[np.ndarray]:
-        counts = 2 ** (where % 4 + 1)
-        return [
-            own._tracer.split(where, counts, where, True, maps),
-            own._tracer.spread(where, where, True, maps),
-            own._tracer.soft(where, counts, where, True, gloss=False),
-            own._tracer.soft(where, 4, where, True, gloss=True),
-            own._tracer.split(where, 8, 3, False, maps[:1]),
-        ]
-
-    first = []
-    for t_s in (0.004, 0.0113, 0.0126, 0.004):
-        inputs = np.flatnonzero(own.traced(t_s)), own._maps_at(t_s)
-        own._scene.set_time(t_s)  # once: normals that Mitsuba adds up in threads may differ in the last bit
-        recorded = launched(*inputs)
-        with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
-            traced = launched(*inputs)
-        for found, expected in zip(recorded, traced, strict=True):
-            np.testing.assert_array_equal(found, expected)
-        first.append(recorded[0])
-    assert not np.array_equal(first[0], first[1])
-    assert own._tracer._radiance_of.frozen.n_recordings <= 3 and own._tracer._soft_of.frozen.n_recordings <= 4
-
-
 @one_world
 def test_garbage_is_collected_before_or_after_a_recording(r, monkeypatch):
     """An array of NumPy's memory that is freed in a recording ends the process: an old renderer's, at any time."""
