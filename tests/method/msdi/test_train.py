@@ -230,7 +230,7 @@ def test_data_that_is_kept_for_tests_is_refused(tmp_path: Path) -> None:
     write_toy_shard(tmp_path, 9000)
     with pytest.raises(UserError, match="those from 13 to 8999, found toy-1, toy-9000; remove them"):
         train_msdi(data=tmp_path, out=tmp_path / "out", config="tiny")
-    names = "paper, small, tiny, bottleneck, bottleneck-tiny, images, images-tiny"
+    names = "paper, small, tiny, bottleneck, bottleneck-tiny, images, images-tiny, images-without-.*"
     with pytest.raises(UserError, match=f"--config: expected one of {names}, found 'large'"):
         train_msdi(data=tmp_path, out=tmp_path / "out", config="large")
     assert not (tmp_path / "out").exists()
