@@ -255,8 +255,8 @@ def trainer_algorithm(recipe: Recipe, parts: Parts) -> Algorithm:
     def fit(job: FitJob) -> FittedModel:
         return fit_gaussians(job, MotionSpec(recipe.motion, job.extent, job.settings["motion"]), motion, supervision)
 
-    gray, loss = motion.image is Motion.image, supervision
-    return Algorithm(motion.label, settings, fit, motion.published, (), loss.calibrated, loss.shaded, layers=gray)
+    found = Algorithm(motion.label, settings, fit, motion.published, layers=motion.image is Motion.image)
+    return replace(found, calibrated=supervision.calibrated, shaded=supervision.shaded)
 
 
 def fit_gaussians(

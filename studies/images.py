@@ -145,8 +145,9 @@ def told(scene: Scene) -> dict[str, Calibration]:
     seen = replace(scene.training, recordings=())
     for camera in scene.test:
         seen = with_camera(seen, scene.cameras[camera], scene.stream(camera), None)
-    start = rig(as_pinholes(seen))
-    shaded = with_shadings(seen, replace(start, cameras=with_lenses(as_pinholes(seen), start.cameras)))
+    straight = as_pinholes(seen)
+    start = rig(straight)
+    shaded = with_shadings(seen, replace(start, cameras=with_lenses(straight, start.cameras)))
     found = {camera: shaded.state(camera).shading for camera in scene.test}
     return {c: Calibration.of_shading(s, scene.radiance_gain) for c, s in found.items() if s is not None}
 

@@ -17,12 +17,12 @@ class ImageConfig:
     without: str = ""  # for ablations: a name of `INPUTS` that the network does not see, or `MOVING_LOSS`
 
 
-INPUTS = {  # first and last channel of what the network sees beside `adaptive`'s image; the spikes are the last
-    "error-bar": (1, 1),
-    "windows": (2, 3),
-    "beside": (4, 5),
-    "sensor": (6, 7),
-    "spikes": (8, 48),
+INPUTS = {  # channels of what the network sees beside `adaptive`'s image; after those of `inputs` come the spikes
+    "error-bar": slice(1, 2),
+    "windows": slice(2, 4),
+    "beside": slice(4, 6),
+    "sensor": slice(6, 8),
+    "spikes": slice(8, None),
 }
 MOVING_LOSS = "moving-loss"  # the second term of the loss, of where things move
 

@@ -44,7 +44,7 @@ class ImageNetwork(nn.Module):
         seen = spikes.to(channels) * torch.where(sensitivity > 0, 1 / sensitivity, 0.0)
         x = torch.cat([channels, seen], dim=1)
         if hidden := INPUTS.get(self.config.without):
-            x[:, hidden[0] : hidden[1] + 1] = 0
+            x[:, hidden] = 0
         x = functional.pad(x, (0, -width % _SIDE, 0, -height % _SIDE))
         full = self.stem(x.contiguous(memory_format=torch.channels_last))  # convolutions take two thirds of the time
         half = self.to_two(full)

@@ -24,6 +24,7 @@ from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.scene.calibration import rates
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.method.starts.array_motion import deviation
 from spike4dgs.method.starts.base import Start
 
 ORDER = 4  # of the polynomials: 15 numbers a camera
@@ -118,19 +119,14 @@ def _solve(terms: Float64, seen: Float64) -> tuple[Float64, float]:
         found = np.linalg.solve(normal, right.ravel()).reshape(cameras, k)
         found -= found.mean(axis=0)
         unexplained = _less_point(seen - np.einsum("ck,ckn->cn", found, terms), weights)
-        rest = _spread(unexplained[ok])
-        weights = ok / (1 + (np.where(ok, unexplained, 0) / max(_FAR * rest, 1e-9)) ** 2) ** 2
+        rest = deviation(unexplained[ok])
+        weights = ok / (1 + (np.where(ok, unexplained, 0) / (_FAR * rest)) ** 2) ** 2
     return found, rest
 
 
-def _less_point(seen: Float64, weights: Float64 | np.ndarray) -> Float64:
+def _less_point(seen: Float64, weights: Float64) -> Float64:
     """Return logarithms [C, N] less the weighted mean of each point; 0 where it is not seen."""
     ok = np.isfinite(seen)
     known = np.where(ok, seen, 0.0)
     mean = (weights * known).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
     return np.where(ok, known - mean, 0.0)
-
-
-def _spread(values: Float64) -> float:
-    """Return a standard deviation that few outliers do not move."""
-    return 1.4826 * float(np.median(np.abs(values)))

@@ -134,7 +134,7 @@ class _Search:
             rows.append(row[known])
             errors.append(error[known])
         row, error = np.concatenate(rows), np.concatenate(errors)
-        weight = 1 / np.square(1 + np.square(error / _deviation(error)))
+        weight = 1 / np.square(1 + np.square(error / deviation(error)))
         weighted = row * weight[:, None]
         return weighted.T @ row, weighted.T @ error
 
@@ -154,7 +154,7 @@ class _Search:
                 still = self._errors(index, window, _BLURS_PX[1], points)[0]
                 moved = self._errors(index, window, _BLURS_PX[1], points @ pose[:3, :3].T + pose[:3, 3])[0]
                 known = np.isfinite(still) & np.isfinite(moved)
-                limit = _CHANGES * min(_deviation(still[known]), _deviation(moved[known]))
+                limit = _CHANGES * min(deviation(still[known]), deviation(moved[known]))
                 by_still, by_path = (np.abs(errors[known]) < limit for errors in (still, moved))
                 votes += np.count_nonzero(by_path & ~by_still), np.count_nonzero(by_still & ~by_path)
         ends = [self.path.posed(self.cameras, t) for t in (0.0, 1.0)]
@@ -185,6 +185,6 @@ def _sampled(image: Float32, uv: Float64) -> Float64:
     return np.asarray(found[:, 0], np.float64)
 
 
-def _deviation(values: Float64) -> float:
+def deviation(values: Float64) -> float:
     """Return the standard deviation of most values, by the median of their sizes."""
     return max(1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0, 1e-6)

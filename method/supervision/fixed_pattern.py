@@ -83,7 +83,7 @@ class FixedPattern(Supervision):
         flat = np.ones(size[1:], np.float32)
         shading = np.stack([flat if found is None else found for found in told]) - 1
         self.register_buffer("shading", torch.from_numpy(shading), persistent=False)  # a scene tells it again
-        self.register_buffer("gain", torch.from_numpy(shading.copy()))
+        self.register_buffer("gain", self.shading.clone())
         self.register_buffer("dark", torch.full(size, settings.dark / self.white))
         self.register_buffer("sums", torch.zeros(3, *size))
 

@@ -40,7 +40,7 @@ LIGHTS = (1.0, 1 / 4, 1 / 16)
 TICKS = (41, 101, 401)  # 2, 5 and 20 ms
 VIEWS = 8
 ROTATION_DEG, DIRECTION_DEG = 1.0, 5.0  # a pair's bars
-EXPOSURE = 0.25  # mean radiance of COLMAP's images
+EXPOSURE = 0.25  # mean radiance of the images that COLMAP and the plane sweep see
 _NONE = 180.0  # degrees, of pairs without poses
 
 
@@ -74,8 +74,7 @@ def dark_poses(
     rows: list[dict[str, Any]] = []
     for file, number in with_progress(resting_arrays(data, bursts)):
         rows += _kept(file, number, seed, out / "arrays")
-    about = {"commit": harness()["commit"], "cpu": cpu_name(), "command": command_line(), "seed": seed}
-    write_json(out / "poses.json", {**about, "weights": WEIGHTS.in_use().sha256, "rows": rows})
+    write_rows(out / "poses.json", rows, seed)
     _write(rows, out)
     return 0
 
@@ -97,6 +96,12 @@ def with_progress(arrays: Sequence[tuple[BurstFile, int]]) -> Iterator[tuple[Bur
         passed = time.perf_counter() - start
         left = passed / done * (len(arrays) - done)
         print(f"{file.facts.id}: {done}/{len(arrays)} arrays, {passed:.0f} s, about {left:.0f} s left", flush=True)
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], seed: int) -> None:
+    """Write what was measured, and with what."""
+    about = {"commit": harness()["commit"], "cpu": cpu_name(), "command": command_line(), "seed": seed}
+    write_json(path, {**about, "weights": WEIGHTS.in_use().sha256, "rows": rows})
 
 
 def _resting(file: BurstFile, count: int) -> Sequence[int]:

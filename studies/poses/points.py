@@ -18,8 +18,7 @@ from scipy.stats import spearmanr
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.arrays import Float32, Float64
-from spike4dgs.benchmark.environment import command_line, cpu_name, harness
-from spike4dgs.benchmark.files import write_json, write_text
+from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.matching.adjust import Array
 from spike4dgs.method.matching.cost_volume import cell_depths
@@ -28,7 +27,7 @@ from spike4dgs.method.matching.weights import WEIGHTS, load_matcher
 from spike4dgs.method.matching.window_inputs import light_of
 from spike4dgs.method.starts.plane_sweep import full_range, inverse_depth_step, sweep
 from spike4dgs.studies.kit.timing import markdown, show_table
-from spike4dgs.studies.poses.dark import EXPOSURE, LIGHTS, Sight, named, resting_arrays, see, with_progress
+from spike4dgs.studies.poses.dark import EXPOSURE, LIGHTS, Sight, named, resting_arrays, see, with_progress, write_rows
 
 TICKS = (101, 401)  # 5 and 20 ms
 
@@ -51,8 +50,7 @@ def dark_points(
         out: Folder for the results.
     """
     rows = [row for file, number in with_progress(resting_arrays(data, bursts)) for row in measured(file, number, seed)]
-    about = {"commit": harness()["commit"], "cpu": cpu_name(), "command": command_line(), "seed": seed}
-    write_json(out / "points.json", {**about, "weights": WEIGHTS.in_use().sha256, "rows": rows})
+    write_rows(out / "points.json", rows, seed)
     table = [_line(rows, light, ticks) for light in LIGHTS for ticks in TICKS]
     scores = ("error", "surer half", "rank")
     columns = ("light", "clip, ms", *(f"{name}: {what}" for name in FINDERS for what in scores))
