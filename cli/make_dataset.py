@@ -44,7 +44,7 @@ def make_dataset(
         also: Options of camera and light of further scenes of each world, such as light=0.25 lens=-0.2,0.03
             "read-noise=0.006 dead-ticks=1". Scenes that differ in sensors, light, lost ticks or given poses alone are
             rendered once.
-        audit: Compare random ticks and ground truth with full renderings of 4 times the samples; see the report.
+        audit: Compare random ticks with full renderings of 4 times the samples, and measure noise; see the report.
         replace: Make damaged scenes, and scenes with other settings, again.
         check: A folder of reference scenes, such as a release, or one scene folder. Scenes in OUT are made only where
             they are absent, and compared with those of the same id there: equal, rendering noise, or a change of the

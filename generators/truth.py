@@ -1,15 +1,14 @@
 """The truth of a scene: ground truth on disk, its noise, and the audit of the radiance that the sensors received.
 
-`make-dataset --audit`: the error of the radiance that the sensors received, against full renderings.
+`make-dataset --audit`: the error of the radiance that the sensors received, and the noise of it and of ground truth.
 
 At random ticks, mostly between keys, Mitsuba's own render loop renders some views whole with four times the samples of
-a key; they are compared with the interpolated radiance of that instant. Some ground-truth frames are compared with
-renderings of four times their samples. The noise of the reference counts as error too. Where cameras have a lens or a
-blur, which that loop does not know, ours traces every pixel.
+a key; they are compared with the interpolated radiance of that instant. The noise of the reference counts as error too.
+Where cameras have a lens or a blur, which that loop does not know, ours traces every pixel.
 
 Noise alone is known from two further renderings A and B with other random numbers: of an image I, the mean of
 (I - A)(I - B) is the variance of its noise, without bias and without theirs. A and B are made as ground truth is: what
-its procedure changes in the mean is no noise, and is found by renderings of whole paths.
+its procedure changes in the mean is no noise, and is found by A and B of whole paths, whose samples may be few.
 """
 
 from __future__ import annotations
@@ -88,15 +87,16 @@ def moving_region(
     return np.asarray(grown | binary_opening(lit, np.ones((2, 2))))
 
 
-_TICKS, _VIEWS, _FRAMES, _PAIRS = 4, 3, 3, 3
+_TICKS, _VIEWS, _PAIRS = 3, 2, 3
+_WHOLE = 2  # times at which truth is compared with whole paths
 _SEEDS = (3_000_017, 5_000_011)  # added to a scene's seed: far from those of its own files
 _SECOND_SEEDS = (1_000_003, 2_000_003)  # the same, of the renderings beside a scored image
-_MORE = 4  # times the samples of a key or of ground truth
+_MORE = 4  # times the samples of a key
 _FLOOR = 0.02  # relative errors are in units of the true radiance, or of this where it is darker
 
 
 def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, Any]:
-    """Return the report: errors at random ticks ("ticks") and of ground truth ("ground_truth"), each and in total.
+    """Return the report: errors at random ticks ("ticks"), each and in total, and the `noise`.
 
     Errors: PSNR (dB, range 1, clipped like the scores), mean and 99.9th percentile of the relative error in percent,
     mean absolute error; over the whole image, and over the pixels with motion or changing light.
@@ -116,19 +116,9 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
         for view, image, mask in zip(views, truth, moving, strict=True):
             found = errors(store.radiance(view, plan, tick), image, mask)
             seen.append({"tick": tick, "camera": cameras_of(job)[view].id, "is_key": tick in plan.ticks} | found)
-    camera = cameras_of(job)[held_out]
-    one = along(path_of(job))(world_of(job), [camera], seed=job.seed + 3, spp=p.spp, background_spp=p.spp)
-    rendered = _reference(job, one, _MORE * p.target_spp)
-    frames = []
-    for tick in job.target_ticks[:: max(1, len(job.target_ticks) // _FRAMES)][:_FRAMES]:
-        target = Target(camera.id, tick)
-        truth = rendered(tick / RATE_HZ)[0] * np.float32(job.light_at(tick))
-        image, mask = read_exr(scene / f"images/{target.name}.exr"), read_mask(mask_file(scene, target))
-        frames.append({"tick": tick, "camera": camera.id} | errors(image, truth, mask))
     return {
-        "samples": {"ticks": _MORE * p.spp, "ground_truth": _MORE * p.target_spp},
+        "samples": {"ticks": _MORE * p.spp},
         "ticks": {"total": _total(seen), "each": seen},
-        "ground_truth": {"total": _total(frames), "each": frames},
         "noise": noise(job, store, plan, scene),
     }
 
@@ -178,14 +168,14 @@ def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, di
         "truth": _noise(truths, others, moving, masks) | _correlation(truths, others, moving, pairs),
     }
     if job.profile.soft is not None:
-        spp = job.profile.target_spp
+        spp = job.profile.target_spp // 2  # their noise cancels
         paths = [
             MultiViewRenderer(
                 world_of(job), [camera], seed=job.seed + s, spp=spp, background_spp=spp, psf_px=job.physics.psf_px
             )
             for s in _SEEDS
         ]
-        some = ticks[: 1 + len(ticks) // 2]
+        some = ticks[:_WHOLE]
         whole = {t: [r.crn_frames(t / RATE_HZ)[0] for r in paths] for t in some}
         found["truth_against_paths"] = _noise({t: truths[t] for t in some}, whole, moving, masks)
     return found
