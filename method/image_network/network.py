@@ -40,19 +40,29 @@ class ImageNetwork(nn.Module):
         See `inputs`.
         """
         height, width = channels.shape[2:]
-        sensitivity = 1 + channels[:, 6:7]
-        seen = spikes.to(channels) * torch.where(sensitivity > 0, 1 / sensitivity, 0.0)
-        x = torch.cat([channels, seen], dim=1)
-        if hidden := INPUTS.get(self.config.without):
-            x[:, hidden] = 0
-        x = functional.pad(x, (0, -width % _SIDE, 0, -height % _SIDE))
-        full = self.stem(x.contiguous(memory_format=torch.channels_last))  # convolutions take two thirds of the time
+        full = self.stem(self._seen(channels, spikes))
         half = self.to_two(full)
         quarter = self.from_four(self.to_four(half))
         half = self.two(half + functional.interpolate(quarter, scale_factor=2.0, mode="nearest"))
         up = functional.interpolate(self.from_two(half), scale_factor=2.0, mode="nearest")
         change = self.change(self.one(full + up))[:, 0, :height, :width]
         return channels[:, 0] + change.to(channels)
+
+    def _seen(self, channels: Tensor, spikes: Tensor) -> Tensor:
+        """Return the padded inputs in the order `channels_last`, with which convolutions take two thirds of the time.
+
+        They are written in place: copies of them took as long as a fifth of the convolutions.
+        """
+        n, given, height, width = channels.shape
+        size = (n, given + spikes.shape[1], height + -height % _SIDE, width + -width % _SIDE)
+        x = torch.empty(size, device=channels.device, memory_format=torch.channels_last).zero_()
+        inside = x[:, :, :height, :width]
+        inside[:, :given].copy_(channels)
+        sensitivity = 1 + channels[:, 6:7]
+        inside[:, given:].copy_(spikes).mul_(torch.where(sensitivity > 0, 1 / sensitivity, 0.0))
+        if hidden := INPUTS.get(self.config.without):
+            x[:, hidden] = 0
+        return x
 
 
 def rate_of(root: Tensor, unit: float) -> Tensor:
