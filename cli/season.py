@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
@@ -28,6 +29,7 @@ def make(
     worlds: tuple[str, ...],
     secret: Path,
     profile: str = "small",
+    rendering: Literal["paths", "split"] = "split",
     closes: str | None = None,
     hide_streams: bool = False,
     budget: str = DEFAULT_BUDGET,
@@ -45,6 +47,7 @@ def make(
         worlds: Worlds, one hidden scene of each.
         secret: Folder for the seeds and the scenes, which only its owner can read.
         profile: Profile of the scenes: tiny, small or paper.
+        rendering: Of the scenes, as make-dataset has it.
         closes: Last day of submissions, such as 2027-01-31; they end with the reveal if left out.
         hide_streams: Publish no training streams: methods alone can be submitted.
         budget: Budget of methods that the maintainers run: quick, standard, paper, or a multiple of quick.
@@ -55,8 +58,8 @@ def make(
     from spike4dgs.generators import make_dataset as scenes
 
     def make_scene(seed: Seed, out: Path) -> int:
-        settings = scenes.SceneSettings(seed.profile, int(seed.seed), seed.variant)
-        return scenes.make_dataset([settings.job(seed.world)], out, workers=workers)
+        one = scenes.SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=rendering)
+        return scenes.make_dataset([one.job(seed.world)], out, workers=workers)
 
     folder = season_folder(seasons, number)
     if make_season(
@@ -66,6 +69,7 @@ def make(
         seasons,
         make_scene,
         profile=profile,
+        rendering=rendering,
         closes=closes,
         hide_streams=hide_streams,
         budget=budget,

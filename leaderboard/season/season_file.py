@@ -24,17 +24,19 @@ from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT
 
 OPENING_NAME, OPENING_SCHEMA = "opening.json", "spike4dgs-season-opening/1"
 SALT_BITS, SEED_BITS = 256, 128
+PATHS, SPLIT = "paths", "split"  # renderings of `make-dataset`
 _FIX = "restore the file that `season make` wrote"
 
 
 @dataclass(frozen=True)
 class Seed:
-    """A hidden scene's world, variant and profile, and its seed as decimal digits, for `make-dataset`."""
+    """What `make-dataset` needs to make a hidden scene; the seed as decimal digits."""
 
     world: str
     variant: int
     profile: str
     seed: str
+    rendering: str = PATHS
 
     @property
     def scene(self) -> str:
@@ -44,8 +46,13 @@ class Seed:
     @property
     def command(self) -> str:
         """The command line that makes the scene."""
-        where = f"--profile {self.profile} --variant {self.variant}"
+        where = f"--profile {self.profile} --variant {self.variant} --rendering {self.rendering}"
         return f"spike4dgs make-dataset {self.world} {where} --seed {self.seed}"
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What opening.json holds of it; paths, the rendering of season 0, are not named."""
+        return {k: v for k, v in asdict(self).items() if (k, v) != ("rendering", PATHS)}
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,7 @@ class Opening:
     @property
     def text(self) -> str:
         """The bytes of opening.json: equal openings have equal texts."""
-        return json_text({"schema": OPENING_SCHEMA, **asdict(self), "scenes": [asdict(s) for s in self.scenes]})
+        return json_text({"schema": OPENING_SCHEMA, **asdict(self), "scenes": [s.facts for s in self.scenes]})
 
     @property
     def sha256(self) -> str:
@@ -73,13 +80,13 @@ class Opening:
         return hashlib.sha256(self.text.encode()).hexdigest()
 
 
-def draw_opening(season: int, worlds: Sequence[str], profile: str) -> Opening:
+def draw_opening(season: int, worlds: Sequence[str], profile: str, rendering: str = SPLIT) -> Opening:
     """Return an opening with a salt and seeds from the system's source of randomness.
 
     Every scene has variant FIRST_SEASON_VARIANT + `season`.
     """
     variant = FIRST_SEASON_VARIANT + season
-    seeds = tuple(Seed(world, variant, profile, str(secrets.randbits(SEED_BITS))) for world in worlds)
+    seeds = tuple(Seed(world, variant, profile, str(secrets.randbits(SEED_BITS)), rendering) for world in worlds)
     return Opening(season, secrets.token_hex(SALT_BITS // 8), harness(), seeds)
 
 

@@ -50,7 +50,8 @@ def test_public_files_alone_say_what_remains(over: Made, capsys: pytest.CaptureF
     out = capsys.readouterr().out
     assert out.count("ok: ") == 2 and out.count("not checked: ") == 6
     for seed in read_opening(over.public / OPENING_NAME).scenes:
-        assert f"spike4dgs make-dataset {seed.world} --profile tiny --variant 9003 --seed {seed.seed} --out" in out
+        way = f"--profile tiny --variant 9003 --rendering split --seed {seed.seed} --out"
+        assert f"spike4dgs make-dataset {seed.world} {way}" in out
 
 
 def test_season_0_is_revealed_and_right(capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,7 +73,7 @@ def test_a_scene_made_again_from_its_seed_is_the_committed_one(
 ) -> None:
     render_fakes(monkeypatch)
     for seed in read_opening(over.public / OPENING_NAME).scenes:
-        settings = SceneSettings(seed.profile, int(seed.seed), seed.variant)
+        settings = SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering="split")
         make_dataset([settings.job(seed.world)], over.root / "again")
     assert checked(over, scenes=over.root / "again") == 0
     assert capsys.readouterr().out.count("is the scene committed to") == 2

@@ -32,6 +32,7 @@ def test_the_commitments_are_those_of_what_was_made(made: Made) -> None:
     for scene, seed in zip(season.scenes, drawn.scenes, strict=True):
         whole = open_scene(scene_folder(made.secret, scene.id))
         assert str(whole.meta["source"]["seed"]) == seed.seed
+        assert seed.rendering == "split" and "soft" in whole.meta["source"]["sampling"]
         assert (scene.revision, scene.pack_sha256) == (
             whole.revision,
             sha256_file(pack_file(made.secret, scene.id, training=False)),
@@ -94,6 +95,7 @@ def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]
         ({"worlds": ("car",)}, "give the same arguments"),
         ({"number": 4}, "give the same arguments"),
         ({"profile": "small"}, "give the same arguments"),
+        ({"rendering": "paths"}, "give the same arguments"),
         ({"number": -1}, "number: expected a number from 0 up"),
         ({"worlds": ("car", "car")}, "--worlds: expected worlds, each once"),
         ({"worlds": ()}, "--worlds: expected worlds, each once, found none"),

@@ -46,6 +46,13 @@ def test_the_commitment_depends_on_everything_in_it() -> None:
     assert OPENING.salt in OPENING.text and all(s.seed in OPENING.text for s in OPENING.scenes)
 
 
+def test_a_rendering_by_whole_paths_is_not_named_as_in_season_0(tmp_path: Path) -> None:
+    paths = draw_opening(3, ("car",), "tiny", "paths")
+    write_secret(tmp_path, paths)
+    assert "rendering" not in paths.text and OPENING.text.count('"rendering": "split"') == 2
+    assert read_opening(tmp_path / OPENING_NAME, paths.sha256) == paths
+
+
 @given(position=st.integers(0, len(TEXT) - 1), byte=st.integers(0, 255))
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_changed_byte_is_refused(tmp_path: Path, position: int, byte: int) -> None:
