@@ -65,9 +65,9 @@ def test_an_array_that_stands_still_has_no_path_and_the_same_start(travel, capsy
 @pytest.mark.parametrize(
     ("share", "motion_px", "believed"),
     [
-        (0.73, 2.58, True),  # turntable-10, array that moves
+        (0.85, 2.58, True),  # turntable-10, array that moves
         (0.80, 0.53, False),  # bricks-10, 50 ms: the array stands still, and what flies feigns a path
-        (0.67, 2.58, False),
+        (0.63, 1.95, False),  # bricks-0: so does what falls together
     ],
 )
 def test_what_is_believed(share, motion_px, believed):
