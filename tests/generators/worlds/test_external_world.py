@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -52,11 +53,13 @@ def test_the_world_is_found_beside_our_own(installed: Path) -> None:
 
 @pytest.mark.slow
 def test_it_passes_the_tests_of_the_worlds(installed: Path) -> None:
-    done = python(
-        installed, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "-k", "pinwheel", str(Path(__file__).parent)
-    )
+    # Not this file: it would install the package once more, and clear away the temporary folders of earlier runs.
+    chosen = f"pinwheel and not {Path(__file__).name}"
+    options = ("-n", "0", "-p", "no:cacheprovider", "-k", chosen)
+    done = python(installed, "-m", "pytest", *options, str(Path(__file__).parent))
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count(".") >= 10, "not without a test"
+    (passed,) = re.findall(r"(\d+) passed", done.stdout)
+    assert int(passed) >= 8, "not without a test"
 
 
 @pytest.mark.parametrize("first", ["pinwheel_world", "spike4dgs.generators.worlds"])
