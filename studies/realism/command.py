@@ -129,12 +129,15 @@ def realism(
     found = sensor_with(reset_noise or 0.0, clock_ripple or 0.0) if given else fit_sensor(spikes, fitted, seed + 30)
     sensors, rng = {"before": sensor_with(0.0, 0.0), "after": found}, np.random.default_rng(seed)
     report: dict[str, Any] = {"reset_noise": found.reset_noise, "clock_ripple": found.clock_ripple, "seed": seed}
+    pairs = {
+        (make, name): _counterpart_and_control(make, spikes, sensor, seed)
+        for make in (w.counterpart, w.moving_counterpart)
+        for name, sensor in sensors.items()
+    }
     for region, of in corners.items():
-        make: Counterpart = w.moving_counterpart if region == "moving" else w.counterpart
-        for name, sensor in sensors.items():
-            made = make(spikes, sensor, seed + 10)
+        for name in sensors:
+            made, again = pairs[w.moving_counterpart if region == "moving" else w.counterpart, name]
             report[f"{region}, {name}"] = compare(w.halves(spikes), made, of).report(rng)
-            again = make(np.concatenate(made), sensor, seed + 20)
             report[f"{region}, {name}, control"] = compare(made, again, of).report(rng)
     report["ranks"] = _ranks(spikes, regions, sensors, seed)
     write_json(out / "realism.json", report)
@@ -150,13 +153,19 @@ def realism(
     return 0
 
 
+def _counterpart_and_control(
+    make: Counterpart, spikes: UInt8, sensor: Sensor, seed: int
+) -> tuple[list[UInt8], list[UInt8]]:
+    """Return the counterpart of a recording, and the counterpart of that one."""
+    made = make(spikes, sensor, seed + 10)
+    return made, make(np.concatenate(made), sensor, seed + 20)
+
+
 def _ranks(spikes: UInt8, regions: dict[str, Mask], sensors: dict[str, Sensor], seed: int) -> dict[str, Any]:
     light, makers = w.course(spikes), makers_here()
     recordings = {"real": spikes, **{name: w.record(*light, sensor, seed) for name, sensor in sensors.items()}}
-    errors = {
-        region: {name: prediction_errors(recorded, pixels, makers) for name, recorded in recordings.items()}
-        for region, pixels in regions.items()
-    }
+    found = {name: prediction_errors(recorded, regions, makers) for name, recorded in recordings.items()}
+    errors = {region: {name: of[region] for name, of in found.items()} for region in regions}
     tau = {
         region: {name: agreement(of["real"], of[name]) for name in of if name != "real"}
         for region, of in errors.items()

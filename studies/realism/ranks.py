@@ -26,18 +26,21 @@ def makers_here() -> dict[str, ImageMaker]:
     return {**MAKERS, **{name: IMAGES[name] for name in NETWORKS if IMAGES[name].learned() is not None}}
 
 
-def prediction_errors(spikes: UInt8, pixels: Mask, makers: Mapping[str, ImageMaker] = MAKERS) -> dict[str, float]:
-    """Return each maker's mean squared error, spikes per tick, of the next NEXT ticks' rate over `pixels` [H, W].
+def prediction_errors(
+    spikes: UInt8, regions: Mapping[str, Mask], makers: Mapping[str, ImageMaker] = MAKERS
+) -> dict[str, dict[str, float]]:
+    """Return for each of `regions` [H, W] each maker's mean squared error, in spikes per tick, of the next NEXT ticks.
 
     An image is made of the SEEN ticks before alone, and asked for at their end.
     """
-    errors: dict[str, list[float]] = {name: [] for name in makers}
+    errors: dict[str, dict[str, list[float]]] = {region: {name: [] for name in makers} for region in regions}
     for tick in range(SEEN, len(spikes) - NEXT + 1, 2 * NEXT):
         seen, truth = stream_of(spikes[tick - SEEN : tick]), spikes[tick : tick + NEXT].mean(0)
         for name, maker in makers.items():
             image = maker(seen, [SEEN - 1], 1.0)[0]
-            errors[name].append(float(np.mean((image - truth)[pixels] ** 2)))
-    return {name: float(np.mean(values)) for name, values in errors.items()}
+            for region, pixels in regions.items():
+                errors[region][name].append(float(np.mean((image - truth)[pixels] ** 2)))
+    return {region: {name: float(np.mean(of)) for name, of in found.items()} for region, found in errors.items()}
 
 
 def agreement(first: Mapping[str, float], second: Mapping[str, float]) -> float:

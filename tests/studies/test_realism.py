@@ -131,7 +131,7 @@ def test_the_fit_finds_the_sensor_and_sees_half_the_squares(monkeypatch):
 
 def test_long_windows_predict_still_pixels_better():
     _, spikes = still()
-    errors = prediction_errors(spikes, np.ones(spikes.shape[1:], bool))
+    errors = prediction_errors(spikes, {"all": np.ones(spikes.shape[1:], bool)})["all"]
     assert [*errors] == [*MAKERS]
     assert errors["tfp, 10 ticks"] > errors["tfp, 40 ticks"] > errors["tfp, 80 ticks"] > errors["adaptive"]
     assert agreement(errors, errors) == 1 and agreement(errors, {k: -v for k, v in errors.items()}) == -1
@@ -192,6 +192,6 @@ def test_a_real_camera_is_told_less_from_the_mended_sensor():
 def test_networks_predict_where_their_weights_are():
     _, spikes = still()
     shipped = {name: makers_here()[name] for name in ("spk2img", "msdi")}
-    errors = prediction_errors(spikes, np.ones(spikes.shape[1:], bool), {**MAKERS, **shipped})
+    errors = prediction_errors(spikes, {"all": np.ones(spikes.shape[1:], bool)}, {**MAKERS, **shipped})["all"]
     assert errors["tfp, 80 ticks"] < errors["spk2img"] < errors["tfp, 10 ticks"], "as a window of some ticks"
     assert errors["tfp, 80 ticks"] < errors["msdi"] < errors["tfp, 10 ticks"]
