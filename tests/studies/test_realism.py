@@ -152,6 +152,7 @@ def recording(tmp_path_factory):
 
 def test_the_study_finds_the_sensor_that_made_a_recording(recording, monkeypatch, tmp_path):
     monkeypatch.setattr("spike4dgs.studies.realism.command.TILE", SQUARE)
+    monkeypatch.setattr("spike4dgs.studies.realism.ranks.NETWORKS", ("msdi",))  # the quickest of them
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- realism -->\nold\n<!-- end realism -->\nafter\n")
     size = {"width": 6 * SQUARE, "height": 4 * SQUARE}
@@ -160,6 +161,8 @@ def test_the_study_finds_the_sensor_that_made_a_recording(recording, monkeypatch
     assert report["still, before"]["auc"] > 0.7 > 0.62 > report["still, after"]["auc"]
     assert report["still, before"]["features"]["one interval"] < 0.3  # the recording has more of it
     assert set(report["ranks"]["kendall"]) == {"still", "beside motion", "moving"}
+    for found in report["ranks"]["errors"].values():
+        assert all([*errors] == [*MAKERS, "msdi"] for errors in found.values())
     text = page.read_text()
     assert text.startswith("before\n<!-- realism -->\n| windows") and "old" not in text and text.endswith("after\n")
     assert (tmp_path / "out/realism.png").stat().st_size > 1000
