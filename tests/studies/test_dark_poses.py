@@ -53,8 +53,6 @@ def test_estimators_see_the_light_that_there_is_without_the_pixels_pattern(tmp_p
         expected = still * file.facts.radiance_gain * light
         assert np.sqrt(np.mean((sight.means - expected) ** 2)) < 0.004 + 0.02 * light
         assert np.median(np.abs(sight.intervals / expected - 1)) < 0.2
-    rotation, direction = errors_of(ESTIMATORS["matching network"](see(burst, file, 1.0, 401, rng), 0), sight.cameras)
-    assert rotation.max() < 1 and direction.max() < 5
 
 
 def test_the_table_has_shares_of_pairs_in_each_condition(
@@ -69,7 +67,7 @@ def test_the_table_has_shares_of_pairs_in_each_condition(
     assert [row["world"] for row in rows] == ["toy-12"] * 2 * len(ESTIMATORS)
     assert all(len(row["rotation_deg"]) == len(row["direction_deg"]) == 28 for row in rows)
     _, _, bright, black = (tmp_path / "out" / "poses.md").read_text().splitlines()
-    assert bright.startswith("| 1 | 2 | 100 % / 100 % |")
+    assert bright == "| 1 | 2 |" + " 100 % / 100 % |" * len(ESTIMATORS)  # within 1 and 5 degrees
     assert black == "| 1/4096 | 2 |" + " 0 % / 0 % |" * len(ESTIMATORS)
     assert (tmp_path / "out" / "poses.png").stat().st_size > 1000
     assert "1/1 arrays" in capsys.readouterr().out
