@@ -172,11 +172,7 @@ def test_fine_keys_give_fast_pixels_and_the_rest_is_close(r, tmp_path):
     plan = KeyPlan(40, 20_000, 0.05, (20, 4, 2, 1))
     store = KeyStore(tmp_path)
     store.set_static(r.static)
-    for tick in range(10, 31):  # the disc turns steadily: one interval and its neighbours are enough
-        store.put(tick, r.key_arrays(tick, plan))
-    for tick in (0, 40):
-        store.put(tick, r.key_arrays(tick, plan))
-    for tick in (4, 8, 32, 36):
+    for tick in (0, 4, 8, *range(10, 25), 28, 32, 36, 40):  # the disc turns steadily: one interval is enough
         store.put(tick, r.key_arrays(tick, plan))
     clip = store.instants(1, plan)
     shares = []
@@ -195,11 +191,11 @@ def test_ticks_with_fast_motion_are_rendered_inside_the_tick():
     """A disc that turns by 4 px a tick: the rendered mean is nearer to a fine mean than the mean of two keys is."""
     slow = built("turntable")
     spin = replace(slow, poses=lambda t: slow.poses(40 * t))
-    r = MultiViewRenderer(spin, cameras(spin, WIDTH, HEIGHT, (4,)), seed=0, spp=64, background_spp=64)
+    r = MultiViewRenderer(spin, cameras(spin, WIDTH, HEIGHT, (4,)), seed=0, spp=16, background_spp=16)
     plan = KeyPlan(20, 20_000, 0.2, (1,), sub_ticks=8)
     arrays = r.key_arrays(7, plan)
     given = np.flatnonzero(np.unpackbits(arrays["mean_given0"], count=WIDTH * HEIGHT))
-    truth = np.mean([r._traced_at(given, (7 + (k + 0.5) / 20) / 20_000) for k in range(20)], axis=0)
+    truth = np.mean([r._traced_at(given, (7 + (k + 0.5) / 10) / 20_000) for k in range(10)], axis=0)
     two = (r._traced_at(given, 7 / 20_000) + r._traced_at(given, 8 / 20_000)) / 2
     assert len(given) > 0.1 * WIDTH * HEIGHT
     assert np.abs(arrays["mean_values0"] - truth).mean() < 0.35 * np.abs(two - truth).mean()
