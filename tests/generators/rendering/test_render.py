@@ -45,7 +45,7 @@ def r(request) -> Iterator[MultiViewRenderer]:
 
 @pytest.fixture(scope="module")
 def truth(r) -> np.ndarray:
-    return r.reference_frames(T_S, 1024)
+    return r.reference_frames(T_S, 256)
 
 
 def test_keys_are_the_full_rendering_inside_and_the_background_outside(r):
