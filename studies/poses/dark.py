@@ -21,7 +21,7 @@ from tyro.conf import Positional
 from spike4dgs.baselines.images.tfi import tfi_image
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.environment import command_line, cpu_name, harness
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
@@ -199,7 +199,10 @@ ESTIMATORS: Mapping[str, Callable[[Sight, int], tuple[Camera, ...]]] = {
 
 
 def errors_of(found: Sequence[Camera], true: Sequence[Camera]) -> tuple[Float64, Float64]:
-    """Return the errors in degrees of the rotations and directions of all pairs [P] of `true`; 180 without poses."""
+    """Return the errors in degrees of the rotations and directions of all pairs [P] of `true`; 180 without poses.
+
+    Cameras at one place, as some estimators have them where they see nothing, are no poses.
+    """
     number = {camera.id: k for k, camera in enumerate(true)}
     i, j = np.triu_indices(len(true), 1)
     pair = np.zeros((len(true), len(true)), int)
@@ -208,7 +211,10 @@ def errors_of(found: Sequence[Camera], true: Sequence[Camera]) -> tuple[Float64,
     if len(found) >= 2:
         mine = sorted(found, key=lambda camera: number[camera.id])
         places = np.array([number[camera.id] for camera in mine])
-        errors = pose_errors(mine, [true[k] for k in places])
+        try:
+            errors = pose_errors(mine, [true[k] for k in places])
+        except UserError:  # all at one place
+            return rotation, direction
         a, b = (places[k] for k in np.triu_indices(len(mine), 1))
         rotation[pair[a, b]], direction[pair[a, b]] = errors.pair_rotation_deg, errors.pair_direction_deg
     return rotation, direction

@@ -41,6 +41,8 @@ def test_a_turned_camera_and_an_absent_one_count_in_their_pairs_alone() -> None:
     np.testing.assert_allclose(rotation[off], 3, atol=1e-6)
     assert rotation[~absent & ~off].max() < 1e-6
     assert all((error == 180).all() for error in errors_of(found[:1], TRUE))
+    together = [replace(c, t=-c.R @ TRUE[0].center) for c in TRUE]
+    assert all((error == 180).all() for error in errors_of(together, TRUE))
 
 
 def test_estimators_see_the_light_that_there_is_without_the_pixels_pattern(tmp_path: Path) -> None:
