@@ -81,10 +81,10 @@ def headline_block(group: Group, records: Sequence[Record]) -> list[str]:
     """Return a sentence for each knowledge: the lead of the best row of ours."""
     own = of_group(group, records)
     lines = [
-        f"- {knowledge}, `{rows[0].name}`: {_lead_text(rows[0], rivals)} ({commits_text(own).lower()})."
+        f"- {knowledge}, `{rows[0].name}`: {_lead_text(rows[0], rivals)}."
         for knowledge, rows, rivals in _leaders(group, own)
     ]
-    return lines or [NO_LEAD if own else NOTHING]
+    return [*lines, "", f"{commits_text(own)}."] if lines else [NO_LEAD if own else NOTHING]
 
 
 def home_block(records: Sequence[Record]) -> list[str]:

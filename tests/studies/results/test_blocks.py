@@ -150,7 +150,7 @@ def test_a_lead_is_over_the_best_complete_row_with_equal_knowledge() -> None:
     assert "calibrated: 1.05 ± 0.18 dB behind `a` where things move, and" in sentence(-6)
     assert "`c`" not in sentence(0) and "tfp+stg" not in sentence(0)
     headline = f"- calibrated, {sentence(0).removeprefix('- ').replace(', calibrated', '')}"
-    assert headline_block(GROUP, made()) == [f"{headline.removesuffix('.')} (commit c0ffee000000)."]
+    assert headline_block(GROUP, made()) == [headline, "", "Commit c0ffee000000."]
     nobody = [r for r in made() if r["row"] in (OURS, "tfp+stg", "c")]
     for block in (lead_block, headline_block):
         assert block(GROUP, nobody) == [NO_LEAD] and block(GROUP, []) == [NOTHING]
