@@ -2,20 +2,27 @@
 
     python cuda_simulator.py CASE...
 
-The simulator runs a block's threads as Python threads and asks them in a busy loop where they are, which keeps them
-from running. Here they meet at a barrier: in our kernels all threads of a block reach every synchronisation.
+The simulator runs a block's threads as Python threads, which takes most of the time: hundreds of them wait for each
+other. Here they are generators in one thread. They run in turns, in the order of their indices.
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
 import sys
+import textwrap
 import threading
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
 from numba.cuda.simulator import kernel
+from numba.cuda.simulator.kernelapi import Dim3, FakeCUDAShared
+from numba.np.numpy_support import as_dtype
 from splat_parity import compare
 from splat_scenes import HARD, HEIGHT, LENSES, WIDTH, changed, opaque_stack, random_splats, through, views
 
@@ -26,31 +33,63 @@ from spike4dgs.method.splat.types import CUSTOMARY
 SCALE = 0.22  # of the image: 22 x 15 pixels are two tiles
 
 
+class _Pausing(ast.NodeTransformer):
+    """Turns a kernel into a generator that pauses where the kernel waits for the other threads of its block."""
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        node.decorator_list = []
+        return self.generic_visit(node)
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        if isinstance(node.func, ast.Attribute) and node.func.attr in ("syncthreads", "syncthreads_count"):
+            return ast.Yield(*node.args)
+        return self.generic_visit(node)
+
+
+@cache
+def pausing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a kernel's function as a generator function, or as it is if its threads do not wait.
+
+    It yields the argument of `syncthreads_count`, and is sent the count.
+    """
+    names = function.__code__.co_freevars
+    inner = _Pausing().visit(ast.parse(textwrap.dedent(inspect.getsource(function)))).body[0]
+    ast.increment_lineno(inner, function.__code__.co_firstlineno - 1)
+    outer = ast.parse(f"def outer({', '.join(names)}):\n    return {function.__name__}")
+    outer.body[0].body.insert(0, inner)  # type: ignore[attr-defined]
+    found: dict[str, Any] = {}
+    exec(compile(ast.fix_missing_locations(outer), inspect.getfile(function), "exec"), function.__globals__, found)
+    return found["outer"](*(cell.cell_contents for cell in function.__closure__ or ()))  # type: ignore[no-any-return]
+
+
 def run_block(self: Any, grid_point: Any, *args: Any) -> None:
-    """Run one block's threads to their end; raise the first one's exception."""
-    size = int(np.prod(self._block_dim))
-    barrier = threading.Barrier(size)
-    threads = []
-    for point in np.ndindex(*self._block_dim):
+    """Run one block's threads in turns, each to where it waits for the others, to their end."""
+    here: Any = threading.current_thread()  # which the simulator asks for the indices
+    here.blockIdx = Dim3(*grid_point)
+    indices = [Dim3(*point) for point in np.ndindex(*self._block_dim)]
+    turns = []
+    for here.threadIdx in indices:
+        turns.append(pausing(self._f)(*args))
+    if not inspect.isgeneratorfunction(pausing(self._f)):
+        return
+    count = None
+    while True:
+        said = []
+        for here.threadIdx, turn in zip(indices, turns, strict=True):
+            with suppress(StopIteration):
+                said.append(turn.send(count))
+        assert len(said) in (0, len(turns)), "some threads wait for threads that have ended"
+        if not said:
+            return
+        count = sum(map(bool, said))
 
-        def target() -> None:
-            try:
-                self._f(*args)
-            except BaseException:
-                barrier.abort()
-                raise
 
-        thread = kernel.BlockThread(target, self, grid_point, point, False)
-        thread.syncthreads = barrier.wait
-        threads.append(thread)
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    failed = [t.exception for t in threads if t.exception and t.exception[0] is not threading.BrokenBarrierError]
-    failed += [t.exception for t in threads if t.exception]
-    if failed:
-        raise failed[0][0].with_traceback(failed[0][1])
+def shared_array(self: Any, shape: Any, dtype: Any) -> Any:
+    """Return the array that a block's threads share. The simulator's own reads the whole stack to know the line."""
+    line = sys._getframe(1).f_lineno
+    if line not in self._allocations:
+        self._allocations[line] = np.empty(shape, as_dtype(dtype))
+    return self._allocations[line]
 
 
 def small(splats: Splats, v: Views, count: int = 12) -> tuple[Splats, Views]:
@@ -133,8 +172,7 @@ CASES: dict[str, Callable[[], None]] = {
 
 
 if __name__ == "__main__":
-    kernel.BlockManager.run = run_block
-    sys.setswitchinterval(1.0)  # a thread runs to the next barrier: it gains nothing by turns with others
+    kernel.BlockManager.run, FakeCUDAShared.array = run_block, shared_array
     for name in sys.argv[1:]:
         CASES[name]()
         print(name)
