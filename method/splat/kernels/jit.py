@@ -23,6 +23,8 @@ _OPTIONS: dict[str, Any] = {
     "boundscheck": False,
     "nogil": True,
 }
+# Only kernels are called from Python: numba's ways into a helper from there would be a fifth of its compilation.
+_INSIDE: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_OPTIONS}
 _lock = threading.Lock()
 _announced = False
 
@@ -34,12 +36,12 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 def helper(function: Callable[..., Any]) -> Any:
     """Compile a function that exists only inlined into kernels."""
-    return njit(forceinline=True, **_OPTIONS)(function)
+    return njit(forceinline=True, **_INSIDE)(function)
 
 
 def template(function: Callable[..., Any]) -> Any:
     """Compile a helper that is inlined before type inference, so that literal arguments stay literal inside."""
-    return njit(inline="always", **_OPTIONS)(function)
+    return njit(inline="always", **_INSIDE)(function)
 
 
 @cache

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 CHILD = r"""
-import json, re
+import gc, json, re
+gc.disable()  # the compiler makes many objects, and none of them is garbage for long
 import llvmlite.binding as llvm
 import numpy as np
 import torch
