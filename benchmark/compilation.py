@@ -50,7 +50,8 @@ class _Deferred:
 
         with _deferred:
             if self._compiled is None:
-                self._compiled = cached_jit(numba.njit, **self._options)(self._function)
+                # No way in from C, which nothing takes and which would be compiled too.
+                self._compiled = cached_jit(numba.njit, no_cfunc_wrapper=True, **self._options)(self._function)
         return self._compiled
 
 

@@ -89,7 +89,7 @@ def _count(packed: UInt8, table: UInt64, counts: NDArray[np.uint16], start: int,
         for group in range(0, n, 255):  # eight planes count to 255
             planes[:] = 0
             for t in range(group, min(group + 255, n)):
-                carry[:size] = packed[t, first : first + size]
+                _copy(packed[t, first : first + size], carry)
                 reached = t - group + 1  # no count is larger yet, so higher planes receive no carry
                 level = 0
                 while reached > 0:
@@ -104,6 +104,13 @@ def _count(packed: UInt8, table: UInt64, counts: NDArray[np.uint16], start: int,
                 for j in range(size):
                     words[2 * (first + j)] += table[planes[level, j], 0] << np.uint64(level)
                     words[2 * (first + j) + 1] += table[planes[level, j], 1] << np.uint64(level)
+
+
+@kernel
+def _copy(source: UInt8, target: UInt8) -> None:
+    """Copy into the beginning of an array. Numba compiles seconds for `target[:n] = source`: an error about shapes."""
+    for j in range(np.uint64(len(source))):
+        target[j] = source[j]
 
 
 def unpack(packed: UInt8, width: int, height: int, flip: bool) -> UInt8:
