@@ -89,7 +89,7 @@ def _count(packed: UInt8, table: UInt64, counts: NDArray[np.uint16], start: int,
         for group in range(0, n, 255):  # eight planes count to 255
             planes[:] = 0
             for t in range(group, min(group + 255, n)):
-                _copy(packed[t, first : first + size], carry)
+                copy_into(packed[t, first : first + size], carry)
                 reached = t - group + 1  # no count is larger yet, so higher planes receive no carry
                 level = 0
                 while reached > 0:
@@ -107,8 +107,8 @@ def _count(packed: UInt8, table: UInt64, counts: NDArray[np.uint16], start: int,
 
 
 @kernel
-def _copy(source: UInt8, target: UInt8) -> None:
-    """Copy into the beginning of an array. Numba compiles seconds for `target[:n] = source`: an error about shapes."""
+def copy_into(source: NDArray[Any], target: NDArray[Any]) -> None:
+    """Copy to the beginning of an array. Numba compiles seconds for `target[:n] = source`: an error about shapes."""
     for j in range(np.uint64(len(source))):
         target[j] = source[j]
 

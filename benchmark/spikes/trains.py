@@ -21,7 +21,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from spike4dgs.benchmark.arrays import Int64, UInt8, UInt32, UInt64
-from spike4dgs.benchmark.spikes.bits import in_threads, kernel, rows
+from spike4dgs.benchmark.spikes.bits import copy_into, in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
@@ -128,7 +128,7 @@ def _accumulate(words: UInt64, before: UInt32, start: int, stop: int) -> None:
     total = np.zeros(stop - start, np.uint32)
     for w in range(len(words)):
         if w % _COUNTED == 0:
-            before[w // _COUNTED, start:stop] = total
+            copy_into(total, before[w // _COUNTED, start:stop])
         for p in range(start, stop):
             total[p - start] += np.uint32(_ones(words[w, p]))
 
