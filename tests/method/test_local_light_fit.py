@@ -50,7 +50,7 @@ def fitted(coarse: int, fine: int, apart: bool = True) -> FittedModel:
 
 @pytest.mark.slow
 def test_each_gaussian_has_a_share_of_the_lamp(capsys: pytest.CaptureFixture[str]) -> None:
-    own = fitted(40, 100)
+    own = fitted(30, 70)
     assert "the light of a part of the scene changes" in capsys.readouterr().err
     assert own.background.colors.shape[1] == 2 and own.light is not None
     # What is to the right has more of the lamp, and what does not move is no foreground because its light changes.
@@ -58,7 +58,7 @@ def test_each_gaussian_has_a_share_of_the_lamp(capsys: pytest.CaptureFixture[str
     share = own.background.colors[:, 1] / own.background.colors[:, 0]
     assert share[right].median() > 3 * share[own.background.means[:, 0] < -0.4].median()
     assert len(own.background) > len(own.pieces[0])
-    whole = fitted(40, 100, apart=False)
+    whole = fitted(30, 70, apart=False)
     assert "fitted in its mean" in capsys.readouterr().err
     assert whole.background.colors.shape[1] == 1
     for moving in (False, True):

@@ -91,7 +91,7 @@ def test_fifty_steps_in_float32_are_those_in_float64(motion: str) -> None:
 @pytest.mark.slow
 def test_three_seeds_agree() -> None:
     """Seeds have a standard deviation of 0.3 dB: three are hardly 1 dB apart."""
-    long = method("paths", {"trainer.fine_steps": 200})
+    long = method("paths", {"trainer.fine_steps": 100})
     fits = [long.fit(WORLD.training, request(seed)) for seed in range(3)]
     scores = [WORLD.psnr(fit, moving=False) for fit in fits]
     assert max(scores) - min(scores) < 1

@@ -28,7 +28,7 @@ def compiled():
     return {(d.py_func.__module__, d.py_func.__qualname__, str(s)) for d in found for s in d.overloads}
 
 METHODS = find_methods()
-world = ToyWorld()
+world = ToyWorld(width=48, height=30, n_ticks=120)
 _ = world.training.streams
 for name in NAMES:
     METHODS[name].warm_up(FitRequest())

@@ -188,14 +188,14 @@ def twin(fired, lost):
     return fired, certain
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 130), st.integers(1, 14)), min_size=1, max_size=12),
     st.booleans(),
     st.integers(0, 2**31),
 )
 def test_the_kernel_is_its_twin_whatever_is_lost(gaps, even, seed):
-    rng, lost, size = np.random.default_rng(seed), np.zeros(140, bool), (3, WIDTH)
+    rng, lost, size = np.random.default_rng(seed), np.zeros(140, bool), (2, WIDTH)
     rates = rng.random(size) ** 2
     spikes = (rng.random((140, *size)) < rates).astype(np.uint8)
     if even:
@@ -210,7 +210,7 @@ def test_the_kernel_is_its_twin_whatever_is_lost(gaps, even, seed):
     sure = np.unpackbits(stream.certain, axis=1, count=rates.size, bitorder="little").reshape(-1, *size)
     found = stream.window(0, 140).reshape(140, -1), sure[:, ::-1].reshape(len(sure), -1)
     wrong = (found[0] != expected[0]).any(axis=0) | (found[1] != expected[1][lost]).any(axis=0)
-    assert wrong.sum() <= 1, "of 63 pixels: what is as near may round to either side"
+    assert wrong.sum() <= 1, "of 42 pixels: what is as near may round to either side"
 
 
 def filled_ticks(spikes, lost):
@@ -256,8 +256,8 @@ def test_a_bad_pixel_fires_as_its_neighbour(bottom_up):
 
 def test_gaps_of_a_mapped_file_are_filled_next_to_it(tmp_path):
     """The file stays as it is, and of its pages the few that change are in memory."""
-    width, height, ticks = 256, 128, 4000  # a page a tick
-    gaps = tuple(Gap("cam_00", first, 2, "overflow") for first in range(100, 3900, 400))
+    width, height, ticks = 256, 128, 2000  # a page a tick
+    gaps = tuple(Gap("cam_00", first, 2, "overflow") for first in range(100, 1900, 400))
     path = tmp_path / "lost.dat"
     path.write_bytes(np.random.default_rng(0).bytes(ticks * width * height // 8))
     stream = open_stream(path, width, height, 20000.0, gaps=gaps)
