@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 CHILD = r"""
-import builtins, importlib, io, os, pathlib, sys, traceback
+import builtins, gc, importlib, io, os, pathlib, sys, traceback
+
+gc.disable()  # thousands of modules are read, and none of them is garbage
 
 # Libraries look at the system while they load; ours are loaded after it has changed.
 import distributed, drjit, fsspec, jsonschema, matplotlib.pyplot, mitsuba, mujoco, numba, psutil, pycolmap, rich.console
