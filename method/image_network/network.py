@@ -55,7 +55,7 @@ class ImageNetwork(nn.Module):
         """
         n, given, height, width = channels.shape
         size = (n, given + spikes.shape[1], height + -height % _SIDE, width + -width % _SIDE)
-        x = torch.empty(size, device=channels.device, memory_format=torch.channels_last).zero_()
+        x = torch.empty(size, dtype=channels.dtype, device=channels.device, memory_format=torch.channels_last).zero_()
         inside = x[:, :, :height, :width]
         inside[:, :given].copy_(channels)
         sensitivity = 1 + channels[:, 6:7]

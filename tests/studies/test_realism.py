@@ -162,7 +162,7 @@ def test_the_study_finds_the_sensor_that_made_a_recording(recording, monkeypatch
     assert report["still, before"]["features"]["one interval"] < 0.3  # the recording has more of it
     assert set(report["ranks"]["kendall"]) == {"still", "beside motion", "moving"}
     for found in report["ranks"]["errors"].values():
-        assert all([*errors] == [*MAKERS, "msdi"] for errors in found.values())
+        assert all({*errors} == {*MAKERS, "msdi"} for errors in found.values())
     text = page.read_text()
     assert text.startswith("before\n<!-- realism -->\n| windows") and "old" not in text and text.endswith("after\n")
     assert (tmp_path / "out/realism.png").stat().st_size > 1000
