@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Literal
 
 from tyro.conf import Positional
 
@@ -20,7 +19,14 @@ from spike4dgs.leaderboard.season import season_file
 from spike4dgs.leaderboard.season.check import checks
 from spike4dgs.leaderboard.season.make import make_season
 from spike4dgs.leaderboard.season.results import predict_all, read_results, score_season
-from spike4dgs.leaderboard.season.season_file import OPENING_NAME, SEASONS, Seed, read_season, season_folder
+from spike4dgs.leaderboard.season.season_file import (
+    OPENING_NAME,
+    SEASONS,
+    Rendering,
+    Seed,
+    read_season,
+    season_folder,
+)
 
 
 def make(
@@ -29,7 +35,7 @@ def make(
     worlds: tuple[str, ...],
     secret: Path,
     profile: str = "small",
-    rendering: Literal["paths", "split"] = "split",
+    rendering: Rendering = "split",
     closes: str | None = None,
     hide_streams: bool = False,
     budget: str = DEFAULT_BUDGET,
@@ -58,8 +64,8 @@ def make(
     from spike4dgs.generators import make_dataset as scenes
 
     def make_scene(seed: Seed, out: Path) -> int:
-        one = scenes.SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=rendering)
-        return scenes.make_dataset([one.job(seed.world)], out, workers=workers)
+        settings = scenes.SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=seed.rendering)
+        return scenes.make_dataset([settings.job(seed.world)], out, workers=workers)
 
     folder = season_folder(seasons, number)
     if make_season(

@@ -14,9 +14,9 @@ from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.season.season_file import (
     OPENING_NAME,
-    SPLIT,
     HiddenScene,
     Opening,
+    Rendering,
     Season,
     Seed,
     draw_opening,
@@ -38,7 +38,7 @@ def make_season(
     make_scene: Callable[[Seed, Path], object],
     *,
     profile: str = "small",
-    rendering: str = SPLIT,
+    rendering: Rendering = "split",
     closes: str | None = None,
     hide_streams: bool = False,
     budget: str = "quick",
@@ -53,7 +53,7 @@ def make_season(
     _check(number, worlds, closes)
     make_budget(budget)
     with locked(secret / ".lock", secret, "a folder in which nobody else makes a season"):
-        drawn = _opening(number, worlds, (profile, rendering), secret)
+        drawn = _opening(number, worlds, profile, rendering, secret)
         if is_announced(seasons, number):
             if (committed := read_season(seasons, number).opening_sha256) != drawn.sha256:
                 where, expected = season_folder(seasons, number), f"the commitment {drawn.sha256[:16]}... of --secret"
@@ -92,19 +92,18 @@ def _check(number: int, worlds: Sequence[str], closes: str | None) -> None:
         raise problem("--closes", "a day such as 2027-01-31", repr(closes), "correct it") from None
 
 
-def _opening(number: int, worlds: Sequence[str], made: tuple[str, str], secret: Path) -> Opening:
+def _opening(number: int, worlds: Sequence[str], profile: str, rendering: Rendering, secret: Path) -> Opening:
     """Return the opening in SECRET, or a new one, written before anything is rendered: a killed run keeps its seeds.
 
-    `made` is the profile and the rendering. Raises UserError where the one in SECRET is for another season, other
-    scenes or other code.
+    Raises UserError where the one in SECRET is for another season, other scenes or other code.
     """
     path = secret / OPENING_NAME
     if not path.exists():
-        write_secret(secret, draw_opening(number, worlds, *made))
+        write_secret(secret, draw_opening(number, worlds, profile, rendering))
     drawn = read_opening(path)
     ways = {(s.profile, s.rendering) for s in drawn.scenes}
     found = (drawn.season, [s.world for s in drawn.scenes], ways, drawn.harness)
-    expected = (number, list(worlds), {made}, harness())
+    expected = (number, list(worlds), {(profile, rendering)}, harness())
     if found != expected:
         fix = "give the same arguments with the same version of the code, or another --secret"
         raise problem(path, f"season, worlds, profile, rendering and code {expected}", str(found), fix)

@@ -13,7 +13,7 @@ import secrets
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from spike4dgs.benchmark.environment import harness
 from spike4dgs.benchmark.errors import problem
@@ -24,7 +24,7 @@ from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT
 
 OPENING_NAME, OPENING_SCHEMA = "opening.json", "spike4dgs-season-opening/1"
 SALT_BITS, SEED_BITS = 256, 128
-PATHS, SPLIT = "paths", "split"  # renderings of `make-dataset`
+Rendering = Literal["paths", "split"]  # of `make-dataset`
 _FIX = "restore the file that `season make` wrote"
 
 
@@ -36,7 +36,7 @@ class Seed:
     variant: int
     profile: str
     seed: str
-    rendering: str = PATHS
+    rendering: Rendering = "paths"
 
     @property
     def scene(self) -> str:
@@ -52,7 +52,7 @@ class Seed:
     @property
     def facts(self) -> dict[str, Any]:
         """What opening.json holds of it; paths, the rendering of season 0, are not named."""
-        return {k: v for k, v in asdict(self).items() if (k, v) != ("rendering", PATHS)}
+        return {k: v for k, v in asdict(self).items() if (k, v) != ("rendering", "paths")}
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Opening:
         return hashlib.sha256(self.text.encode()).hexdigest()
 
 
-def draw_opening(season: int, worlds: Sequence[str], profile: str, rendering: str = SPLIT) -> Opening:
+def draw_opening(season: int, worlds: Sequence[str], profile: str, rendering: Rendering = "split") -> Opening:
     """Return an opening with a salt and seeds from the system's source of randomness.
 
     Every scene has variant FIRST_SEASON_VARIANT + `season`.

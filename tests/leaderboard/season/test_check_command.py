@@ -73,7 +73,7 @@ def test_a_scene_made_again_from_its_seed_is_the_committed_one(
 ) -> None:
     render_fakes(monkeypatch)
     for seed in read_opening(over.public / OPENING_NAME).scenes:
-        settings = SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering="split")
+        settings = SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=seed.rendering)
         make_dataset([settings.job(seed.world)], over.root / "again")
     assert checked(over, scenes=over.root / "again") == 0
     assert capsys.readouterr().out.count("is the scene committed to") == 2
