@@ -175,7 +175,7 @@ def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, di
             )
             for s in _SEEDS
         ]
-        some = ticks[:_WHOLE]
+        some = [t for t, _ in pairs[:_WHOLE]]
         whole = {t: [r.crn_frames(t / RATE_HZ)[0] for r in paths] for t in some}
         found["truth_against_paths"] = _noise({t: truths[t] for t in some}, whole, moving, masks)
     return found

@@ -109,7 +109,7 @@ def _count(packed: UInt8, table: UInt64, counts: NDArray[np.uint16], start: int,
 @kernel
 def copy_into(source: NDArray[Any], target: NDArray[Any]) -> None:
     """Copy to the beginning of an array. Numba compiles seconds for `target[:n] = source`: an error about shapes."""
-    for j in range(np.uint64(len(source))):
+    for j in range(np.uint64(len(source))):  # unsigned: no index counts from the end
         target[j] = source[j]
 
 
