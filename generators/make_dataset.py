@@ -24,7 +24,7 @@ from spike4dgs.benchmark.scene.scene import SCHEMA
 from spike4dgs.benchmark.screen.bars import Pace, left_text, make_bars, seconds_text
 from spike4dgs.benchmark.variants import is_reserved
 from spike4dgs.generators.physics import NO_OPTIONS, PhysicsOptions
-from spike4dgs.generators.profiles import PROFILES, RATE_HZ, SPLIT_PROFILES, TARGET_EVERY, TRACKS, Job
+from spike4dgs.generators.profiles import PROFILES, RATE_HZ, SPLIT_PROFILES, TARGET_EVERY, TRACKS, Job, with_finer
 from spike4dgs.generators.render_tasks import cameras_of, world_of
 from spike4dgs.generators.rendering.mitsuba_variant import pick_variant
 from spike4dgs.generators.scene_check import check_scenes, find_references
@@ -121,7 +121,8 @@ def track_jobs(track: str, worlds: Sequence[str], settings: SceneSettings) -> li
     physics = replace(settings.physics, camera=t.camera)
     common = replace(settings, profile=t.profile, rendering="split", physics=physics)
     every = [replace(common, variant=variant) for variant in t.variants]
-    return [one.job(world) for world in worlds for one in every]
+    jobs = [one.job(world) for world in worlds for one in every]
+    return [replace(job, profile=with_finer(job.profile)) if job.world in t.finer else job for job in jobs]
 
 
 def make_dataset(
