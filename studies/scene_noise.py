@@ -16,10 +16,14 @@ from tyro.conf import Positional
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_text
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
+from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.leaderboard.tracks import short
+from spike4dgs.studies.kit.blocks import pattern
 from spike4dgs.studies.kit.timing import markdown, show_table, write_csv
 
 COLUMNS = (
     "scene",
+    "revision",
     "made in, s",
     "streams: whole, moving, objects, dB",
     "correlation 1 ms apart",
@@ -31,34 +35,46 @@ GOALS_DB = {"streams": 46.0, "truth": 52.0}
 _REGIONS = ("whole_db", "moving_db", "object_db")
 
 
-def scene_noise(folders: Positional[tuple[Path, ...]] = (Path("data"),), *, out: Path = Path("runs/noise")) -> int:
+def scene_noise(
+    folders: Positional[tuple[Path, ...]] = (Path("data"),),
+    *,
+    out: Path = Path("runs/noise"),
+    page: Path | None = None,
+) -> int:
     """Tabulate and plot the rendering noise of audited scenes: OUT/noise.md, .csv and .png.
 
     Args:
         folders: Folders of scenes that `make-dataset --audit` made, with their reports ID.report.json.
         out: Folder for the results.
+        page: Results page whose block `<!-- noise -->` gets the rows. Rows of other scenes that it has stay.
     """
-    reports = [
-        read_json(path, "a scene's report") for folder in folders for path in sorted(folder.glob("*.report.json"))
+    found = [
+        (folder, read_json(path, "a scene's report"))
+        for folder in folders
+        for path in sorted(folder.glob("*.report.json"))
     ]
+    reports = [report for _, report in found]
     audited = [report for report in reports if (report.get("audit") or {}).get("noise")]
     if not audited:
         expected, found = "reports of audited scenes", f"{len(reports)} reports without an audit" if reports else "none"
         raise problem(", ".join(map(str, folders)), expected, found, "make scenes with `make-dataset --audit`")
-    rows = [_row(report) for report in audited]
+    rows = [_row(report, folder / report["scene"]) for folder, report in found if report in audited]
     write_text(out / "noise.md", "\n".join([*markdown(COLUMNS, rows), ""]))
     write_csv(out / "noise.csv", COLUMNS, rows)
     _plot(audited, out / "noise.png")
+    if page is not None:
+        _write_page(page, rows)
     show_table("", COLUMNS, rows, None)
     print(f"written: {out}/noise.md, .csv, .png")
     return 0
 
 
-def _row(report: dict[str, Any]) -> list[str]:
+def _row(report: dict[str, Any], scene: Path) -> list[str]:
     noise, ticks = report["audit"]["noise"], report["audit"]["ticks"]["total"]
     streams, truth = noise["streams"], noise["truth"]
     return [
         report["scene"],
+        short(open_scene(scene).revision),
         f"{report['total_s'] - report['stages_s'].get('audit', 0):.0f}",
         " / ".join(_number(streams[region]) for region in _REGIONS),
         _number(streams["correlation_moving"], 2),
@@ -66,6 +82,16 @@ def _row(report: dict[str, Any]) -> list[str]:
         _number(ticks["mean_percent"]),
         _number(noise.get("truth_against_paths", {}).get("moving_db")),
     ]
+
+
+def _write_page(page: Path, rows: Sequence[Sequence[str]]) -> None:
+    """Put the rows into the page's block, in the order of the scenes' names."""
+    text = page.read_text(encoding="utf-8")
+    here = [line for block in pattern("noise").finditer(text) for line in block[0].splitlines() if line[:2] == "| "]
+    lines = {line.split(" | ")[0]: line for line in [*here[2:], *markdown(COLUMNS, rows)[2:]]}
+    shown = [*markdown(COLUMNS, [])[:2], *(lines[scene] for scene in sorted(lines))]
+    block = "\n".join(["<!-- noise -->", *shown, "<!-- end noise -->"])
+    write_text(page, pattern("noise").sub(lambda _: block, text))
 
 
 def _number(value: float | None, digits: int = 1) -> str:

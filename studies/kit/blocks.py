@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-KINDS = ("records", "searches", "realism")
+KINDS = ("records", "searches", "realism", "noise")
 
 
 def pattern(*kinds: str) -> re.Pattern[str]:

@@ -8,10 +8,13 @@ from pathlib import Path
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.studies.scene_noise import COLUMNS, scene_noise
 
 _STREAMS = {"whole_db": 55.12, "moving_db": 47.93, "object_db": None, "correlation_moving": 0.25}
 _TRUTH = {"whole_db": 58.0, "moving_db": 53.0, "object_db": 52.5, "correlation_moving": 0.1}
+_NOISE = {"streams": _STREAMS, "truth": _TRUTH, "truth_against_paths": {"moving_db": 48.0}}
+_AUDIT = {"noise": _NOISE, "ticks": {"total": {"mean_percent": 1.26}}}
 
 
 def report(folder: Path, scene: str, audit: object) -> None:
@@ -19,15 +22,32 @@ def report(folder: Path, scene: str, audit: object) -> None:
     (folder / f"{scene}.report.json").write_text(json.dumps({"scene": scene, **times, "audit": audit}))
 
 
-def test_a_row_has_the_audits_figures_and_the_time_without_it(tmp_path, capsys):
-    noise = {"streams": _STREAMS, "truth": _TRUTH, "truth_against_paths": {"moving_db": 48.0}}
-    report(tmp_path, "car-0-small", {"noise": noise, "ticks": {"total": {"mean_percent": 1.26}}})
-    report(tmp_path, "van-0-small", None)  # not audited: no row
-    assert scene_noise((tmp_path,), out=tmp_path / "out") == 0
+def test_a_row_has_the_audits_figures_and_the_time_without_it(small_scene, tmp_path, capsys):
+    folder, scene = small_scene.parent, open_scene(small_scene)
+    report(folder, small_scene.name, _AUDIT)
+    report(folder, "van-0-small", None)  # not audited: no row
+    assert scene_noise((folder,), out=tmp_path / "out") == 0
     head, _, *rows = (tmp_path / "out/noise.md").read_text().splitlines()
     assert head == f"| {' | '.join(COLUMNS)} |"
-    assert rows == ["| car-0-small | 220 | 55.1 / 47.9 / - | 0.25 | 58.0 / 53.0 / 52.5 | 1.3 | 48.0 |"]
-    assert "car-0-small" in capsys.readouterr().out and (tmp_path / "out/noise.png").stat().st_size > 1000
+    names = f"{small_scene.name} | {scene.revision[:12]}"
+    assert rows == [f"| {names} | 220 | 55.1 / 47.9 / - | 0.25 | 58.0 / 53.0 / 52.5 | 1.3 | 48.0 |"]
+    assert small_scene.name in capsys.readouterr().out and (tmp_path / "out/noise.png").stat().st_size > 1000
+
+
+def test_a_page_keeps_the_rows_of_other_scenes(small_scene, tmp_path):
+    others = ["| a-0-small | 1 | 2 |", "| z-0-small | 1 | 2 |"]
+    old = f"| {small_scene.name} | its row before |"
+    page = tmp_path / "page.md"
+    page.write_text(
+        "\n".join(["| no row |", "<!-- noise -->", "| head |", "| --- |", *others, old, "<!-- end noise -->"])
+    )
+    report(small_scene.parent, small_scene.name, _AUDIT)
+    assert scene_noise((small_scene.parent,), out=tmp_path / "out", page=page) == 0
+    before, start, head, rule, *rows, end = page.read_text().splitlines()
+    assert (before, start, head) == ("| no row |", "<!-- noise -->", f"| {' | '.join(COLUMNS)} |")
+    assert rule.startswith("| --- |") and end == "<!-- end noise -->"
+    new = (tmp_path / "out/noise.md").read_text().splitlines()[2]
+    assert rows == sorted([*others, new])
 
 
 def test_folders_without_an_audit_are_refused(tmp_path):
