@@ -18,11 +18,13 @@ from spike4dgs.studies.results.tables.images import images_block
 from spike4dgs.studies.results.tables.modality import modality_block, noisy_block
 from spike4dgs.studies.results.tables.parts import own_scenes_block, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
+from spike4dgs.studies.results.tables.realistic import cameras_block, realistic_block
 from spike4dgs.studies.results.tables.steps import steps_block
 
 BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names in markers
     "conditions": conditions_block,
     "breaks": breaks_block,
+    "cameras": cameras_block,
     "content": content_block,
     "headline": lambda records: headline_block(NINE, records),
     "home": home_block,
@@ -34,6 +36,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "pairs": pairs_block,
     "parts": parts_block,
     "published": lambda records: published_block(TABLE1, 1, records),
+    "realistic": realistic_block,
     "steps": steps_block,
     "table1": lambda records: table_block(TABLE1, records),
     "table1-scenes": lambda records: scenes_block(TABLE1, records),

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from spike4dgs.baselines import recipes as theirs
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, DEFAULT_GIVEN, Method
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published
+from spike4dgs.generators.physics import CAMERAS
 from spike4dgs.generators.profiles import TRACKS
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.tuned import SUFFIX as TUNED
@@ -67,9 +68,12 @@ def track_scenes(track: str, worlds: Iterable[str]) -> tuple[str, ...]:
 
     >>> track_scenes("ideal", ["car", "van"])
     ('car-0-small', 'van-0-small')
+    >>> track_scenes("dev-small", ["car"])
+    ('car-10-small-realistic', 'car-11-small-realistic')
     """
     made = TRACKS[track]
-    return tuple(f"{world}-{variant}-{made.profile}" for world in worlds for variant in made.variants)
+    suffix = CAMERAS[made.camera].suffix
+    return tuple(f"{world}-{variant}-{made.profile}{suffix}" for world in worlds for variant in made.variants)
 
 
 # The most important first: what a reader compares with, then what is far behind or costs most.

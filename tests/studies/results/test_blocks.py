@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from spike4dgs.studies.results.blocks import (
 )
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
 from spike4dgs.studies.results.pages import BLOCKS
-from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row
+from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row, track_scenes
 from spike4dgs.studies.results.tables.breaks import breaks_block
 from spike4dgs.studies.results.tables.conditions import (
     CONDITIONS,
@@ -39,6 +40,8 @@ from spike4dgs.studies.results.tables.modality import NOISY, modality_block, noi
 from spike4dgs.studies.results.tables.parts import GROUP as PARTS
 from spike4dgs.studies.results.tables.parts import SWITCHES, own_scenes_block, parts_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
+from spike4dgs.studies.results.tables.realistic import GROUP as TRACK_SMALL
+from spike4dgs.studies.results.tables.realistic import cameras_block, realistic_block
 from spike4dgs.studies.results.tables.steps import steps_block
 
 SHOWN = {  # a block -> two rows that it has, if not those of the tables
@@ -51,7 +54,9 @@ SHOWN = {  # a block -> two rows that it has, if not those of the tables
     "unposed": ("spike4dgs-uncalibrated", "tfp+colmap+stg"),
     "modality-noisy": ("edi+stg", "rgb+stg"),
     "pairs": ("tfp+stg", "tfp+4dgs"),
+    "cameras": ("spike4dgs-x", "tfp+stg"),
     "own-scenes": ("spike4dgs-x",),
+    "realistic": ("spike4dgs-x", "tfp+stg"),
     "parts": ("spike4dgs-x",),
 }
 SCENES = ("bricks-0-small", "chips-0-small", "turntable-0-small", "bird-0-small")
@@ -218,11 +223,13 @@ def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name
     assert BLOCKS[name]([]) == [NOTHING]
     of = {
         "breaks": ON_CONDITIONS,
+        "cameras": replace(TRACK_SMALL, scenes=(*TRACK_SMALL.scenes, *NINE.scenes)),
         "conditions": ON_CONDITIONS,
         "content": CONTENT,
         "modality": ON_SENSORS,
         "modality-noisy": NOISY,
         "parts": PARTS,
+        "realistic": TRACK_SMALL,
         "steps": PARTS,
         "table2": TABLE2,
     }
@@ -431,6 +438,32 @@ def test_what_ours_reaches_on_each_scene_and_in_the_mean():
     assert lines[2] == "| jaywalk | 32.00 | 0.9700 | 30.00 | 0.9600 | 0.050 | - |"
     assert lines[11] == "| **mean** | 36.00 | 0.9700 | 34.00 | 0.9600 | 0.050 | - |"
     assert "18 of 27 planned cells" in lines[-1]
+
+
+def test_the_realistic_cameras_table_is_of_the_scenes_that_were_measured():
+    scenes = track_scenes("small", ["car", "van"])
+    found = [record(OURS, scene, 40.0 + k) for k, scene in enumerate(scenes)]
+    found += [record("tfp+rig-flat+stg", scene, 30.0) for scene in (*scenes, "bird-0-small-realistic")]
+    found += [record("spike4dgs", scene, 35.0) for scene in scenes[1:]]
+    lines = realistic_block(found)
+    assert lines[0].endswith("Means of 6 scenes.")
+    assert [line.split(" | ")[:3] for line in lines[4:6]] == [
+        ["| 1", "`spike4dgs-x`", "42.50"],
+        ["| 2", "`tfp+rig-flat+stg`", "30.00"],
+    ]
+    assert "Incomplete, not ranked: `spike4dgs` (5 of 6 scenes)." in lines
+
+
+def test_cameras_are_compared_on_the_same_worlds():
+    worlds = ("car", "van")
+    realistic = [scene for scene in track_scenes("small", worlds) if "-0-" in scene]
+    found = [record(OURS, scene, 40.0 + k) for k, scene in enumerate(realistic)]
+    found += [record(OURS, scene, 38.0) for scene in track_scenes("ideal", (*worlds, "bird"))]
+    found.append(record(OURS, "car-3-small-realistic", 0.0))  # the ideal camera has no such variant
+    found += [record("tfp+stg", scene, 30.0) for scene in realistic]  # never before the ideal one
+    lines = cameras_block(found)
+    assert lines[2] == f"| `{OURS}` | 40.00 / 38.00 | 42.50 / 40.50 | +2.50 / +2.50 |"
+    assert lines[3] == "" and "the same 2 worlds" in lines[4]
 
 
 def test_a_part_is_worth_what_its_absence_costs():
