@@ -37,7 +37,7 @@ from spike4dgs.generators.render_tasks import (
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.moving_array.renderer import MovingArrayRenderer, along
-from spike4dgs.generators.rendering.render import MultiViewRenderer
+from spike4dgs.generators.rendering.render import MultiViewRenderer, SoftStatic
 
 WholePaths = MultiViewRenderer | MovingArrayRenderer
 _MASK_GROW_PX = 2
@@ -269,5 +269,6 @@ def second_truth(job: Job, view: int, seed: int) -> Callable[[float], NDArray[np
         whole = renderer_of(job, camera, **alike, whole_frames=True)
         return lambda t_s: whole.crn_frames(t_s)[0]
     every: Any = renderer_of(job, cameras_of(job), **alike)
-    one = renderer_of(job, camera, **alike, static=every.static.views([view]), maps_of=lambda: every)
+    soft = SoftStatic(**{name: array[view : view + 1] for name, array in vars(every.soft_static).items()})
+    one = renderer_of(job, camera, **alike, soft_static=soft, maps_of=lambda: every)
     return lambda t_s: one.keys(t_s)[0]
