@@ -50,7 +50,7 @@ def test_public_files_alone_say_what_remains(over: Made, capsys: pytest.CaptureF
     out = capsys.readouterr().out
     assert out.count("ok: ") == 2 and out.count("not checked: ") == 6
     for seed in read_opening(over.public / OPENING_NAME).scenes:
-        way = f"--profile tiny --variant 9003 --rendering split --seed {seed.seed} --out"
+        way = f"--profile tiny --variant 9003 --rendering paths --seed {seed.seed} --out"
         assert f"spike4dgs make-dataset {seed.world} {way}" in out
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,13 @@ from spike4dgs.benchmark.files import locked, sha256_file
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.season import make
 from spike4dgs.generators.make_dataset import make_dataset
-from spike4dgs.generators.profiles import Job
+from spike4dgs.generators.profiles import PROFILES, SPLIT_PROFILES, Job
 from spike4dgs.leaderboard.season.season_file import OPENING_NAME, read_opening
 from spike4dgs.leaderboard.season.secret_folder import pack_file, scene_folder, training_folder
 
 
 def command(made: Made, worlds: tuple[str, ...] = WORLDS, number: int = NUMBER, **options: Any) -> int:
-    given = {"profile": "tiny", "secret": made.secret, "seasons": made.seasons, **options}
+    given = {"profile": "tiny", "rendering": "paths", "secret": made.secret, "seasons": made.seasons, **options}
     return make(number, worlds=worlds, **given)
 
 
@@ -32,7 +33,7 @@ def test_the_commitments_are_those_of_what_was_made(made: Made) -> None:
     for scene, seed in zip(season.scenes, drawn.scenes, strict=True):
         whole = open_scene(scene_folder(made.secret, scene.id))
         assert str(whole.meta["source"]["seed"]) == seed.seed
-        assert seed.rendering == "split" and "soft" in whole.meta["source"]["sampling"]
+        assert seed.rendering == "paths" and "soft" not in whole.meta["source"]["sampling"]
         assert (scene.revision, scene.pack_sha256) == (
             whole.revision,
             sha256_file(pack_file(made.secret, scene.id, training=False)),
@@ -56,11 +57,12 @@ def test_a_killed_run_goes_on_with_its_seeds(tmp_path: Path, monkeypatch: pytest
     made, rendered = Made(tmp_path), []
 
     def dying(jobs: Sequence[Job], out: Path, **options: Any) -> int:
+        assert jobs[0].profile == SPLIT_PROFILES["tiny"], "light is split unless one says otherwise"
         if jobs[0].world == "turntable" and len(rendered) == 1:
             rendered.append("died")
             raise KeyboardInterrupt
         rendered.append(jobs[0].world)
-        return make_dataset(jobs, out, **options)
+        return make_dataset([replace(jobs[0], profile=PROFILES["tiny"])], out, **options)  # for the fake renderer
 
     monkeypatch.setattr("spike4dgs.generators.make_dataset.make_dataset", dying)
     given: dict[str, Any] = {"worlds": WORLDS, "profile": "tiny", "secret": made.secret, "seasons": made.seasons}
@@ -95,7 +97,7 @@ def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]
         ({"worlds": ("car",)}, "give the same arguments"),
         ({"number": 4}, "give the same arguments"),
         ({"profile": "small"}, "give the same arguments"),
-        ({"rendering": "paths"}, "give the same arguments"),
+        ({"rendering": "split"}, "give the same arguments"),
         ({"number": -1}, "number: expected a number from 0 up"),
         ({"worlds": ("car", "car")}, "--worlds: expected worlds, each once"),
         ({"worlds": ()}, "--worlds: expected worlds, each once, found none"),
