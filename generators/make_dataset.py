@@ -122,7 +122,7 @@ def track_jobs(track: str, worlds: Sequence[str], settings: SceneSettings) -> li
     common = replace(settings, profile=t.profile, rendering="split", physics=physics)
     every = [replace(common, variant=variant) for variant in t.variants]
     jobs = [one.job(world) for world in worlds for one in every]
-    return [replace(job, profile=with_finer(job.profile)) if job.world in t.finer else job for job in jobs]
+    return [replace(j, profile=with_finer(j.profile, t.finer[j.world])) if j.world in t.finer else j for j in jobs]
 
 
 def make_dataset(

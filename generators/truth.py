@@ -2,8 +2,8 @@
 
 `make-dataset --audit`: the error of the radiance that the sensors received, and the noise of it and of ground truth.
 
-At random ticks, mostly between keys, Mitsuba's own render loop renders some views whole with four times the samples of
-a key; they are compared with the interpolated radiance of that instant. The noise of the reference counts as error too.
+At random ticks, mostly between keys, Mitsuba's own render loop renders some views whole with up to four times the
+samples of a key; they are compared with the interpolated radiance of that instant. The noise of the reference counts as error too.
 Where cameras have a lens or a blur, which that loop does not know, ours traces every pixel.
 
 Noise alone is known from two further renderings A and B with other random numbers: of an image I, the mean of
@@ -91,7 +91,7 @@ _TICKS, _VIEWS, _PAIRS = 3, 2, 3
 _WHOLE = 2  # times at which truth is compared with whole paths
 _SEEDS = (3_000_017, 5_000_011)  # added to a scene's seed: far from those of its own files
 _SECOND_SEEDS = (1_000_003, 2_000_003)  # the same, of the renderings beside a scored image
-_MORE = 4  # times the samples of a key
+_MORE, _MOST = 4, 512  # times the samples of a key, and samples
 _FLOOR = 0.02  # relative errors are in units of the true radiance, or of this where it is darker
 
 
@@ -109,7 +109,8 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
     p = job.profile
     chosen = [cameras_of(job)[v] for v in views]
     some = along(path_of(job))(world_of(job), chosen, seed=job.seed + 2, spp=p.spp, background_spp=p.spp)
-    rendered = _reference(job, some, _MORE * p.spp)
+    spp = min(_MORE * p.spp, _MOST)
+    rendered = _reference(job, some, spp)
     seen = []
     for tick in ticks:
         truth, moving = rendered(tick / RATE_HZ), some.traced(tick / RATE_HZ)
@@ -117,7 +118,7 @@ def audit(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, An
             found = errors(store.radiance(view, plan, tick), image, mask)
             seen.append({"tick": tick, "camera": cameras_of(job)[view].id, "is_key": tick in plan.ticks} | found)
     return {
-        "samples": {"ticks": _MORE * p.spp},
+        "samples": {"ticks": spp},
         "ticks": {"total": _total(seen), "each": seen},
         "noise": noise(job, store, plan, scene),
     }
