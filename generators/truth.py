@@ -3,8 +3,8 @@
 `make-dataset --audit`: the error of the radiance that the sensors received, and the noise of it and of ground truth.
 
 At random ticks, mostly between keys, Mitsuba's own render loop renders some views whole with up to four times the
-samples of a key; they are compared with the interpolated radiance of that instant. The noise of the reference counts as error too.
-Where cameras have a lens or a blur, which that loop does not know, ours traces every pixel.
+samples of a key; they are compared with the interpolated radiance of that instant. The reference's noise counts as
+error too. Where cameras have a lens or a blur, which that loop does not know, ours traces every pixel.
 
 Noise alone is known from two further renderings A and B with other random numbers: of an image I, the mean of
 (I - A)(I - B) is the variance of its noise, without bias and without theirs. A and B are made as ground truth is: what
