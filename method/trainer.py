@@ -142,7 +142,7 @@ class Trainer:
     def sample(self) -> Sample:
         """Return the current step's views and time."""
         training, (index, views) = self.training_images, self._choose(self.stage, self.step)
-        tick, images = training.ticks[index], training.measured(index)[views]
+        tick, images = training.ticks[index], training.measured(index, views)
         if self.corrections:
             images = images + self.corrections.at(index, views)
         return Sample(tick / training.n_ticks, tick, tuple(views), images, self.step, training.exposure_ticks)

@@ -45,15 +45,15 @@ class TrainingImages:
     exposure_ticks: int = 0  # that images of another sensor are means over, from tick - exposure_ticks // 2 on
     light: Float64 | None = None  # factors [n_ticks] of a lamp that the images show; None: they show one light
 
-    def measured(self, index: int) -> Tensor:
-        """Return the images [C, H, W] of one time for a loss: NaN where nothing was measured."""
-        image = self.images[index]
+    def measured(self, index: int, views: Sequence[int] | slice = slice(None)) -> Tensor:
+        """Return the images [V, H, W] of some views at one time for a loss: NaN where nothing was measured."""
+        image = self.images[index][views]
         if self.bad is not None:
-            image = image.masked_fill(self.bad, math.nan)
+            image = image.masked_fill(self.bad[views], math.nan)
         if self.missing is not None:
-            image = image.masked_fill(self.missing[index][:, None, None], math.nan)
+            image = image.masked_fill(self.missing[index][views][:, None, None], math.nan)
         if self.spans is not None:  # before a pixel's first spike and after its last, a span is of another time
-            first, last = self.spans.at(index).ends.unbind(1)
+            first, last = self.spans.at(index).ends[views].unbind(1)
             image = image.masked_fill((first > 0) | (last < 0), math.nan)
         return image
 
