@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.ssim import huber, l1_and_ssim
-from spike4dgs.method.training_views.training_images import known
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +58,6 @@ def difference(rendered: Tensor, image: Tensor, w: float, delta: float = 0.0) ->
     A pixel of `image` that is no number counts as met, and has no gradient.
     """
     if not (finite := image.isfinite()).all():  # otherwise SSIM's windows would pull at pixels that nothing is known of
-        rendered = torch.where(finite, rendered, rendered.detach())
-        image = known(image, rendered)
+        met = rendered.detach()
+        rendered, image = torch.where(finite, rendered, met), torch.where(finite, image, met)
     return l1_and_ssim(rendered, image, w, delta) if w else huber(rendered, image, delta)
