@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 
 import torch
@@ -48,32 +48,41 @@ class Corrections:
     """The corrections by one snapshot of a model, made when they are first asked for and kept as half floats.
 
     `begin` has them made ahead, in the order in which a fit will ask for them: a thread of its own fills the time in
-    which the fit's other steps keep one core waiting. The values are the same whoever makes them.
+    which the fit's other steps keep one core waiting, and while the fit waits for that thread it makes what comes next
+    itself. The values are the same whoever makes them.
     """
 
     def __init__(self, spans: Spans, render: Callable[[int], RenderViews]) -> None:
         self.spans, self.render = spans, render
         self._made: dict[tuple[int, int], Future[Tensor]] = {}
+        self._ahead: Iterator[tuple[int, Sequence[int]]] = iter(())
         self._lock, self._stopped, self._thread = threading.Lock(), threading.Event(), threading.Thread()
 
     def at(self, index: int, views: Sequence[int]) -> Tensor:
         """Return the corrections [V, H, W] of some views' images of one time."""
         self._make(index, views)
-        return torch.stack([self._made[index, v].result() for v in views]).float()
+        made = [self._made[index, v] for v in views]
+        while not all(future.done() for future in made) and (request := self._next()):
+            self._make(*request)
+        return torch.stack([future.result() for future in made]).float()
 
     def begin(self, requests: Iterable[tuple[int, Sequence[int]]]) -> None:
         """Make what `at` will be asked for, beside the caller, until `stop`."""
+        self._ahead = iter(requests)
 
         def work() -> None:
             work_alone()
             torch.set_num_threads(1)
-            for index, views in requests:
-                if self._stopped.is_set():
-                    return
-                self._make(index, views)
+            while not self._stopped.is_set() and (request := self._next()):
+                self._make(*request)
 
         self._thread = threading.Thread(target=work, name="corrections")
         self._thread.start()
+
+    def _next(self) -> tuple[int, Sequence[int]] | None:
+        """Return what is to be made next, to one thread alone; None where there is no more."""
+        with self._lock:
+            return next(self._ahead, None)
 
     def stop(self) -> None:
         """Make nothing ahead any more; return once the thread that did has ended."""
