@@ -302,7 +302,7 @@ def test_a_track_has_its_variants_of_every_world_and_its_camera(tmp_path):
     jobs = [job for name in TRACKS for job in track_jobs(name, worlds, SceneSettings())]
     assert all(job.profile.soft and job.profile.target_soft for job in jobs)  # rendered by --rendering split
     finer = {job.id for job in jobs if job.profile.spp > 128}
-    assert finer == {f"{w}-{v}-small-realistic" for w in worlds[:5] for v in (0, 3, 4, 10, 11)}
+    assert finer == {f"{w}-{v}-small-realistic" for w in (*worlds[:5], "chips") for v in (0, 3, 4, 10, 11)}
     for settings, track, words in (
         (SceneSettings(), "large", "--track: expected one of small, dev-small, ideal, paper"),
         (SceneSettings(variant=1), "small", "its own profile, variants and camera"),
