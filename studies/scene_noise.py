@@ -48,20 +48,19 @@ def scene_noise(
         out: Folder for the results.
         page: Results page whose block `<!-- noise -->` gets the rows. Rows of other scenes that it has stay.
     """
-    found = [
+    reports = [
         (folder, read_json(path, "a scene's report"))
         for folder in folders
         for path in sorted(folder.glob("*.report.json"))
     ]
-    reports = [report for _, report in found]
-    audited = [report for report in reports if (report.get("audit") or {}).get("noise")]
+    audited = [(folder, report) for folder, report in reports if (report.get("audit") or {}).get("noise")]
     if not audited:
         expected, found = "reports of audited scenes", f"{len(reports)} reports without an audit" if reports else "none"
         raise problem(", ".join(map(str, folders)), expected, found, "make scenes with `make-dataset --audit`")
-    rows = [_row(report, folder / report["scene"]) for folder, report in found if report in audited]
+    rows = [_row(report, folder / report["scene"]) for folder, report in audited]
     write_text(out / "noise.md", "\n".join([*markdown(COLUMNS, rows), ""]))
     write_csv(out / "noise.csv", COLUMNS, rows)
-    _plot(audited, out / "noise.png")
+    _plot([report for _, report in audited], out / "noise.png")
     if page is not None:
         _write_page(page, rows)
     show_table("", COLUMNS, rows, None)
