@@ -18,18 +18,22 @@ GROUP = Group("small", "A realistic camera", track_scenes("small", OURS), CONDIT
 _FIRST = GROUP.rows[0].name  # measured first: its scenes are those of the tables
 
 
+def _measured(records: Sequence[Record]) -> tuple[list[Record], set[str]]:
+    """Return the records of the track, and the scenes that were measured."""
+    own = of_group(GROUP, records)
+    return own, {record["scene"] for record in own if record["row"] == _FIRST}
+
+
 def realistic_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of the rows' table, over the scenes of the track that were measured."""
-    own = of_group(GROUP, records)
-    there = {record["scene"] for record in own if record["row"] == _FIRST}
+    own, there = _measured(records)
     group = replace(GROUP, scenes=tuple(scene for scene in GROUP.scenes if scene in there))
     return table_block(group, own) if there else [NOTHING]
 
 
 def cameras_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of a table of complete rows: the same worlds by the ideal camera and by the realistic one."""
-    names, own = [row.name for row in GROUP.rows], of_group(GROUP, records)
-    there = {record["scene"] for record in own if record["row"] == _FIRST}
+    names, (own, there) = [row.name for row in GROUP.rows], _measured(records)
     pairs = {
         realistic: ideal
         for world in OURS
@@ -50,6 +54,7 @@ def cameras_block(records: Sequence[Record]) -> list[str]:
     lines = [[f"`{r.name}`", both_text(o), both_text(r), change_text(r, o)] for r, o in rows]
     heads = ("row", "ideal camera", "realistic camera", "change")
     legend = f"Whole image / where things move, dB; means of the same {len(pairs)} worlds, variants {PUBLIC_VARIANT}."
-    shown = [record for record in (*own, *ideal) if record["scene"] in {*pairs, *pairs.values()}]
-    group = replace(GROUP, scenes=(*pairs, *pairs.values()))
+    complete, scenes = {r.name for r, _ in rows}, (*pairs, *pairs.values())
+    shown = [r for r in (*own, *ideal) if r["scene"] in scenes and r["row"] in complete]
+    group = replace(GROUP, scenes=scenes, rows=tuple(row for row in GROUP.rows if row.name in complete))
     return [*markdown(heads, lines), "", legend, "", provenance(shown, group)]
