@@ -8,7 +8,15 @@ from dataclasses import replace
 from spike4dgs.benchmark.variants import PUBLIC_VARIANT
 from spike4dgs.generators.worlds import OURS
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance, table_block
+from spike4dgs.studies.results.blocks import (
+    NINE,
+    NOTHING,
+    both_text,
+    change_text,
+    of_group,
+    provenance,
+    table_block,
+)
 from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import Group, track_scenes
 from spike4dgs.studies.results.records import Record
@@ -53,8 +61,14 @@ def cameras_block(records: Sequence[Record]) -> list[str]:
         return [NOTHING]
     lines = [[f"`{r.name}`", both_text(o), both_text(r), change_text(r, o)] for r, o in rows]
     heads = ("row", "ideal camera", "realistic camera", "change")
-    legend = f"Whole image / where things move, dB; means of the same {len(pairs)} worlds, variants {PUBLIC_VARIANT}."
-    complete, scenes = {r.name for r, _ in rows}, (*pairs, *pairs.values())
-    shown = [r for r in (*own, *ideal) if r["scene"] in scenes and r["row"] in complete]
-    group = replace(GROUP, scenes=scenes, rows=tuple(row for row in GROUP.rows if row.name in complete))
-    return [*markdown(heads, lines), "", legend, "", provenance(shown, group)]
+    legend = (
+        f"Whole image / where things move, dB; means of the same {len(pairs)} worlds, variants {PUBLIC_VARIANT}. A blur "
+        "leaves less to get wrong: compare rows within a column."
+    )
+    complete = {r.name for r, _ in rows}
+    groups = [
+        replace(group, scenes=tuple(scenes), rows=tuple(row for row in group.rows if row.name in complete))
+        for group, scenes in ((GROUP, pairs), (NINE, pairs.values()))
+    ]
+    shown = [record for group in groups for record in of_group(group, records)]
+    return [*markdown(heads, lines), "", legend, "", provenance(shown, *groups)]
