@@ -18,12 +18,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Made:
     made = Made(tmp_path_factory.mktemp("season"))
     with pytest.MonkeyPatch.context() as patch:
         render_fakes(patch)
-        given = {
-            "worlds": WORLDS,
-            "profile": "tiny",
-            "budget": "0.02",
-            "rendering": "paths",
-        }  # there is no fake of split
+        given = {"worlds": WORLDS, "profile": "tiny", "budget": "0.02", "rendering": "paths"}  # split has no fake
         assert make(NUMBER, secret=made.secret, seasons=made.seasons, **given) == 0
     made.predict(CountMethod("counts"), CountMethod("rough", steps=1))
     return made
