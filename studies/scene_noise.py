@@ -18,7 +18,7 @@ from spike4dgs.benchmark.files import read_json, write_text
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard.tracks import short
-from spike4dgs.studies.kit.blocks import pattern
+from spike4dgs.studies.kit.blocks import table_rows, with_block
 from spike4dgs.studies.kit.timing import markdown, show_table, write_csv
 
 COLUMNS = (
@@ -86,11 +86,9 @@ def _row(report: dict[str, Any], scene: Path) -> list[str]:
 def _write_page(page: Path, rows: Sequence[Sequence[str]]) -> None:
     """Put the rows into the page's block, in the order of the scenes' names."""
     text = page.read_text(encoding="utf-8")
-    here = [line for block in pattern("noise").finditer(text) for line in block[0].splitlines() if line[:2] == "| "]
-    lines = {line.split(" | ")[0]: line for line in [*here[2:], *markdown(COLUMNS, rows)[2:]]}
-    shown = [*markdown(COLUMNS, [])[:2], *(lines[scene] for scene in sorted(lines))]
-    block = "\n".join(["<!-- noise -->", *shown, "<!-- end noise -->"])
-    write_text(page, pattern("noise").sub(lambda _: block, text))
+    lines = {line.split(" | ")[0]: line for line in [*table_rows(text, "noise"), *markdown(COLUMNS, rows)[2:]]}
+    shown = [*markdown(COLUMNS, []), *(lines[scene] for scene in sorted(lines))]
+    write_text(page, with_block(text, "noise", shown))
 
 
 def _number(value: float | None, digits: int = 1) -> str:

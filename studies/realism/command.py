@@ -23,7 +23,7 @@ from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_fi
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import open_stream
 from spike4dgs.generators.sensor.model import Sensor
-from spike4dgs.studies.kit.blocks import pattern
+from spike4dgs.studies.kit.blocks import with_block
 from spike4dgs.studies.kit.timing import markdown, write_csv
 from spike4dgs.studies.realism import windows as w
 from spike4dgs.studies.realism.classifier import FOLDS, auc_interval, out_of_fold, single_aucs, tiles
@@ -148,8 +148,7 @@ def realism(
     write_plot(out / "realism.png", report)
     print(text)
     if page is not None:
-        block = f"<!-- realism -->\n{text}\n<!-- end realism -->"
-        write_text(page, pattern("realism").sub(lambda _: block, page.read_text("utf-8")))
+        write_text(page, with_block(page.read_text("utf-8"), "realism", [text]))
     return 0
 
 

@@ -33,7 +33,7 @@ from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.tuned import read_tuned
-from spike4dgs.studies.kit.blocks import pattern
+from spike4dgs.studies.kit.blocks import table_rows, with_block
 from spike4dgs.studies.kit.checkout import find_checkout
 from spike4dgs.studies.kit.timing import markdown, write_csv
 from spike4dgs.studies.tuning.kept import keeping
@@ -254,12 +254,10 @@ def publish(out: Path, root: Path) -> None:
         write_json(path, dict(sorted(found.items())))
     page = root / "docs" / "results" / "tuning.md"
     text = page.read_text(encoding="utf-8")
-    here = [line for block in pattern("searches").finditer(text) for line in block[0].splitlines() if line[:3] == "| `"]
     head, rule, *new = (out / "tuning.md").read_text(encoding="utf-8").splitlines()
-    lines = {tuple(line.split(" | ")[:2]): line for line in [*here, *new]}
+    lines = {tuple(line.split(" | ")[:2]): line for line in [*table_rows(text, "searches"), *new]}
     shown = [lines[key] for key in sorted(lines)]
-    block = "\n".join(["<!-- searches -->", head, rule, *shown, "<!-- end searches -->"])
-    write_text(page, pattern("searches").sub(lambda _: block, text))
+    write_text(page, with_block(text, "searches", [head, rule, *shown]))
     for path in sorted(out.glob("*.csv")):
         write_text(root / "docs" / "results" / "tables" / "tuning" / path.name, path.read_text(encoding="utf-8"))
 

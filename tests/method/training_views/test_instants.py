@@ -125,6 +125,32 @@ def test_corrections_made_ahead_are_those_made_when_asked_for() -> None:
     assert sorted(rendered) == once
 
 
+def test_who_waits_for_a_correction_makes_the_next_ones() -> None:
+    """The thread that works ahead cannot finish the first before the caller has made the others."""
+    begun, made_rest = threading.Event(), threading.Event()
+    makers: dict[int, str] = {}
+
+    def around(index: int):
+        def views(ticks: float, chosen: Sequence[int]) -> Tensor:
+            makers[index] = threading.current_thread().name
+            if index == 0:
+                begun.set()
+                assert made_rest.wait(60)
+            elif index == 3:
+                made_rest.set()
+            return torch.full((len(chosen), 2, 2), float(index))
+
+        return views
+
+    corrections = Corrections(Spans(torch.zeros(4, 1, 2, 2, 2), 5.0, 99), around)
+    corrections.begin((index, [0]) for index in range(4))
+    assert begun.wait(60)
+    assert corrections.at(0, [0]).shape == (1, 2, 2)
+    caller = threading.current_thread().name
+    assert makers == {0: "corrections", 1: caller, 2: caller, 3: caller}
+    corrections.stop()
+
+
 def test_no_more_is_made_ahead_once_stopped() -> None:
     begun, go_on = threading.Event(), threading.Event()
     rendered: list[int] = []
