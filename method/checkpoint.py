@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor, nn
-from torch.optim import Adam
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import Progress
-from spike4dgs.method.gaussians.optimizer import export_state, import_state
+from spike4dgs.method.gaussians.optimizer import Adam, export_state, import_state
 from spike4dgs.method.models.model_file import part, read_tensors, write_tensors
 from spike4dgs.method.torch_state import one_torch_thread
 

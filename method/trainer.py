@@ -20,12 +20,12 @@ from spike4dgs.method.array_path import ArrayPath
 from spike4dgs.method.checkpoint import Checkpoint, run_steps
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.optimizer import (
+    Adam,
     Averages,
     Decay,
     apply_edit,
     export_state,
     import_state,
-    make_adam,
     set_learning_rates,
 )
 from spike4dgs.method.gaussians.parameters import Gaussians, appended
@@ -110,7 +110,7 @@ class Trainer:
             **{name: rate for name, (_, rate) in own.items()},
         }
         groups = {name: [leaf] for name, leaf in self.gaussians.tensors().items()}
-        self.adam = make_adam({**groups, **{name: list(p) for name, (p, _) in own.items()}}, (s.beta1, s.beta2))
+        self.adam = Adam({**groups, **{name: list(p) for name, (p, _) in own.items()}}, (s.beta1, s.beta2))
         self.statistics = GradientStatistics.zero(len(self.gaussians), self.gaussians.means.device)
         self.averages = Averages()
 
@@ -170,7 +170,7 @@ class Trainer:
             return self._gray(outputs[-1].image, views, stage, t)
 
         set_learning_rates(self.adam, self.learning_rates, stage.fraction(self.step))
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
         loss = self.supervision(render_at, sample)
         (loss + self.motion.regularizer() + self.coherence(self.gaussians) if stage.deforms else loss).backward()
         self.adam.step()

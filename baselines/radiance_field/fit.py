@@ -20,7 +20,7 @@ from spike4dgs.baselines.radiance_field.model import DynamicField, FieldShape, R
 from spike4dgs.baselines.radiance_field.occupancy import OccupancySettings, may_move
 from spike4dgs.method.checkpoint import Checkpoint, run_steps
 from spike4dgs.method.fit import Algorithm, FitJob
-from spike4dgs.method.gaussians.optimizer import Decay, export_state, import_state, make_adam, set_learning_rates
+from spike4dgs.method.gaussians.optimizer import Adam, Decay, export_state, import_state, set_learning_rates
 from spike4dgs.method.images.training import ImageSettings
 from spike4dgs.method.motion.hexplane import HexPlaneSettings, hexplane_shape, plane_tv, time_smoothness, time_sparsity
 from spike4dgs.method.schedule import GOLDEN
@@ -141,7 +141,7 @@ class Fitter:
         self.recorded = (job.training_images.images * gain).flatten(1)  # [T, C * H * W] mean spikes per tick
         self._begin_grid()
         field, grid, mlp = self.field.parameter_groups()
-        self.adam = make_adam({"field": field, "grid": grid, "deformation": mlp}, (s.beta1, s.beta2))
+        self.adam = Adam({"field": field, "grid": grid, "deformation": mlp}, (s.beta1, s.beta2))
         self.learning_rates = {
             "field": Decay(s.lr_field, s.lr_field_last),
             "grid": Decay(s.lr_grid, s.lr_grid_last),
@@ -183,7 +183,7 @@ class Fitter:
         """Take one step; return the loss."""
         s, grid, generator = self.settings, self.occupancy, seeded(self.job.request.seed, self.step)
         set_learning_rates(self.adam, self.learning_rates, self.step / s.steps)
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
         loss = self.loss(generator)
         loss.backward()
         self.adam.step()

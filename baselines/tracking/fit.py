@@ -42,7 +42,7 @@ from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.fit import Algorithm, FitJob
 from spike4dgs.method.gaussians.density import DensitySettings
-from spike4dgs.method.gaussians.optimizer import Decay, make_adam, set_learning_rates
+from spike4dgs.method.gaussians.optimizer import Adam, Decay, set_learning_rates
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.images.training import ImageSettings
 from spike4dgs.method.motion.table import Static
@@ -230,7 +230,7 @@ class Tracker:
         for leaf in leaves.values():
             leaf.requires_grad_(True)
         loss_of = self.loss(index, old)
-        adam = make_adam({name: [leaf] for name, leaf in leaves.items()}, (s.beta1, s.beta2))
+        adam = Adam({name: [leaf] for name, leaf in leaves.items()}, (s.beta1, s.beta2))
         scale = self.job.extent.scale
         rates = {
             "means": Decay(s.lr_means * scale, s.lr_means_last * scale),
@@ -240,7 +240,7 @@ class Tracker:
         steps = step_count(s, visit)
         for step in range(steps):
             set_learning_rates(adam, rates, step / steps)
-            adam.zero_grad(set_to_none=True)
+            adam.zero_grad()
             order = torch.randperm(
                 len(self.window.views), generator=seeded(self.job.request.seed, (index + 1) * 1_000_000 + step)
             )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam as torch_adam
 
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians
 
@@ -40,42 +41,93 @@ class WarmCosine:
         return self.peak * rise * 0.5 * (1 + math.cos(math.pi * step / self.steps))
 
 
-def make_adam(groups: dict[str, list[Tensor]], betas: tuple[float, float]) -> torch.optim.Adam:
-    """Return Adam with one named group per entry; learning rates are set before each step.
+@dataclass(eq=False)
+class Group:
+    """Parameters with one learning rate."""
 
-    eps is 1e-15 as in 3DGS: gradients of single Gaussians are far below Adam's usual 1e-8.
+    name: str
+    params: list[Tensor]
+    lr: float = 0.0
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015) over named groups, whose learning rates are set before each step.
+
+    The update is torch's own. `torch.optim.Adam` also imports torch's compiler, a second of one core in every process
+    that fits. eps is 1e-15 as in 3DGS: gradients of single Gaussians are far below the usual 1e-8.
     """
-    named = [{"name": name, "params": params} for name, params in groups.items() if params]
-    return torch.optim.Adam(named, lr=0.0, betas=betas, eps=1e-15, fused=True)
+
+    def __init__(self, groups: dict[str, list[Tensor]], betas: tuple[float, float]) -> None:
+        self.groups = [Group(name, params) for name, params in groups.items() if params]
+        self.betas = betas
+        self.state: dict[Tensor, dict[str, Tensor]] = {}  # of the parameters that have had a gradient
+
+    def zero_grad(self) -> None:
+        """Forget all gradients."""
+        for group in self.groups:
+            for p in group.params:
+                p.grad = None
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move every parameter that has a gradient."""
+        for group in self.groups:
+            live = [(p, p.grad) for p in group.params if p.grad is not None]
+            if not live:
+                continue
+            states = [self._state(p) for p, _ in live]
+            step, mean, square = ([state[key] for state in states] for key in ("step", *MOMENTS))
+            torch_adam(
+                [p for p, _ in live],
+                [g for _, g in live],
+                mean,
+                square,
+                [],
+                step,
+                fused=True,
+                amsgrad=False,
+                beta1=self.betas[0],
+                beta2=self.betas[1],
+                lr=group.lr,
+                weight_decay=0.0,
+                eps=1e-15,
+                maximize=False,
+            )
+
+    def _state(self, p: Tensor) -> dict[str, Tensor]:
+        if p not in self.state:
+            zeros = {moment: torch.zeros_like(p) for moment in MOMENTS}
+            self.state[p] = {"step": torch.zeros((), device=p.device), **zeros}
+        return self.state[p]
 
 
-def set_learning_rates(adam: torch.optim.Adam, rates: dict[str, Decay], fraction: float) -> None:
+def set_learning_rates(adam: Adam, rates: dict[str, Decay], fraction: float) -> None:
     """Set every group's learning rate for the point `fraction` in [0, 1] of a stage."""
-    for group in adam.param_groups:
-        group["lr"] = rates[group["name"]].at(fraction)
+    for group in adam.groups:
+        group.lr = rates[group.name].at(fraction)
 
 
-def set_learning_rate(adam: torch.optim.Adam, rate: float) -> None:
+def set_learning_rate(adam: Adam, rate: float) -> None:
     """Set one learning rate for all groups."""
-    for group in adam.param_groups:
-        group["lr"] = rate
+    for group in adam.groups:
+        group.lr = rate
 
 
-def apply_edit(adam: torch.optim.Adam, edit: Edit) -> Gaussians:
+def apply_edit(adam: Adam, edit: Edit) -> Gaussians:
     """Replace the Gaussians' parameters in `adam` by those of an edit, moments included; return the new leaves."""
     new = edit.gaussians.trainable()
     kept = edit.source >= 0
-    for group in adam.param_groups:
-        leaf = new.tensors().get(group["name"])
+    for group in adam.groups:
+        leaf = new.tensors().get(group.name)
         if leaf is None:
             continue
-        state = adam.state.pop(group["params"][0], {})
+        state = adam.state.pop(group.params[0], {})
         for moment in MOMENTS:
             if moment in state:
                 old, fresh = state[moment], torch.zeros_like(leaf)
                 fresh[kept] = old[edit.source[kept]]
                 state[moment] = fresh
-        group["params"] = [leaf]
+        group.params = [leaf]
         if state:
             adam.state[leaf] = state
     return new
@@ -91,31 +143,31 @@ class Averages:
     def __init__(self) -> None:
         self.means: dict[str, Tensor] = {}
 
-    def add(self, adam: torch.optim.Adam, count: int) -> None:
+    def add(self, adam: Adam, count: int) -> None:
         """Take in the parameters of the `count`-th step that is averaged, from 1 on."""
         for name, p in _parameters(adam):
             value = p.detach()
             self.means[name] = value.clone() if count == 1 else self.means[name].lerp_(value, 1 / count)
 
-    def apply(self, adam: torch.optim.Adam) -> None:
+    def apply(self, adam: Adam) -> None:
         """Replace the parameters by their means."""
         with torch.no_grad():
             for name, p in _parameters(adam):
                 p.copy_(self.means[name])
 
 
-def _parameters(adam: torch.optim.Adam) -> Iterator[tuple[str, Tensor]]:
-    for group in adam.param_groups:
-        for i, p in enumerate(group["params"]):
-            yield f"{group['name']}.{i}", p
+def _parameters(adam: Adam) -> Iterator[tuple[str, Tensor]]:
+    for group in adam.groups:
+        for i, p in enumerate(group.params):
+            yield f"{group.name}.{i}", p
 
 
-def export_state(adam: torch.optim.Adam) -> dict[str, Tensor]:
+def export_state(adam: Adam) -> dict[str, Tensor]:
     """Return moments and step counts as `GROUP.INDEX.KEY` -> tensor."""
     return {f"{name}.{key}": value for name, p in _parameters(adam) for key, value in adam.state.get(p, {}).items()}
 
 
-def import_state(adam: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
+def import_state(adam: Adam, tensors: dict[str, Tensor]) -> None:
     """Restore what `export_state` gave, for the same groups and shapes."""
     for name, p in _parameters(adam):
         prefix = f"{name}."

@@ -27,7 +27,7 @@ from spike4dgs.benchmark.scene.training_bursts import BurstFile, open_folder
 from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import read_tensors
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.gaussians.optimizer import make_adam
+from spike4dgs.method.gaussians.optimizer import Adam
 from spike4dgs.method.msdi.checkpoints import transfer
 from spike4dgs.method.msdi.config import MsdiConfig
 from spike4dgs.method.msdi.evaluate import Scores, evaluate
@@ -66,7 +66,7 @@ class Training:
         images: list[Tensor] = [*self.network.extractor.parameters(), *self.network.generator.parameters()]
         own = {id(p) for p in images}
         points: list[Tensor] = [p for p in self.network.parameters() if id(p) not in own]
-        self.adam = make_adam({"images": images, "points": points}, (0.9, 0.999))
+        self.adam = Adam({"images": images, "points": points}, (0.9, 0.999))
         self.step = 0
         self._take = _ahead(self.batch, settings.steps) if device_type(device) == "cuda" else self.batch
 
@@ -94,12 +94,12 @@ class Training:
         image_l1 = image_loss(found.images, rate) / batch.gain
         of_points = point_loss(found.points, found.confidence, points, points.isfinite().all(dim=-1))
         total = image_l1 + of_points  # they share no parameters: there is nothing to weigh
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
         total.backward()
         learning_rates, norms = self.settings.learning_rates(self.step), []
-        for group in self.adam.param_groups:
-            group["lr"] = learning_rates[group["name"]]
-            norms.append(torch.nn.utils.clip_grad_norm_(group["params"], 1.0))
+        for group in self.adam.groups:
+            group.lr = learning_rates[group.name]
+            norms.append(torch.nn.utils.clip_grad_norm_(group.params, 1.0))
         if all(norm.isfinite() for norm in norms):  # else the step is skipped: one bad sample must not ruin the network
             self.adam.step()
         self.step += 1

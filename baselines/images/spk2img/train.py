@@ -37,7 +37,7 @@ from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.variants import HIDDEN_VARIANTS, PUBLIC_VARIANTS, is_reserved
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.gaussians.optimizer import WarmCosine, make_adam, set_learning_rate
+from spike4dgs.method.gaussians.optimizer import Adam, WarmCosine, set_learning_rate
 from spike4dgs.method.images.base import HALF_WINDOW, WINDOW, window
 
 
@@ -186,7 +186,7 @@ class Training:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.network = Spk2ImgNet(settings.width).to(device)
-        self.adam = make_adam({"network": list(self.network.parameters())}, (0.9, 0.999))
+        self.adam = Adam({"network": list(self.network.parameters())}, (0.9, 0.999))
         self.step = 0
 
     def batch(self) -> Batch:
@@ -201,7 +201,7 @@ class Training:
         rate, gain = (torch.from_numpy(a).to(self.device) for a in (batch.rate, batch.gain))
         set_learning_rate(self.adam, self.settings.schedule.at(self.step))
         loss = loss_of(self.network(spikes), rate, gain, self.settings.estimate_weight)
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
         loss.backward()
         # One bad patch must not undo a small network: gradients are a tenth of this once it has learned the mean.
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)

@@ -21,7 +21,7 @@ from spike4dgs.benchmark.environment import available_cores, device_type
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.gaussians.optimizer import make_adam
+from spike4dgs.method.gaussians.optimizer import Adam
 from spike4dgs.method.image_network.config import MOVING_LOSS, ImageConfig, ImageTraining
 from spike4dgs.method.image_network.network import ImageNetwork, log_mse
 from spike4dgs.method.image_network.training.data import ImageBatch, draw
@@ -83,7 +83,7 @@ class ImageNetworkTraining:
             self.shards = frozenset(WEIGHTS.read_card(start).trained_on)
             WEIGHTS.fill(start, self.network, f"configuration {config.name}").train().requires_grad_(True)
         self.network.to(device)
-        self.adam = make_adam({"all": list(self.network.parameters())}, (0.9, 0.999))
+        self.adam = Adam({"all": list(self.network.parameters())}, (0.9, 0.999))
         self.step = 0
 
     def batches(self) -> Iterator[ImageBatch]:
@@ -103,12 +103,12 @@ class ImageNetworkTraining:
         with torch.autocast(kind, torch.bfloat16, enabled=kind == "cuda"):
             found = self.network(channels, spikes)
         losses = torch.stack([log_mse(found, truth, weight) for weight in weights])
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
         asked = losses[:1] if self.network.config.without == MOVING_LOSS else losses
         asked.sum().backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        for group in self.adam.param_groups:
-            group["lr"] = self.settings.learning_rate(self.step)
+        for group in self.adam.groups:
+            group.lr = self.settings.learning_rate(self.step)
         if norm.isfinite():  # else the step is skipped: one bad sample must not ruin the network
             self.adam.step()
         self.step += 1

@@ -20,7 +20,7 @@ from torch import nn
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.gaussians.optimizer import make_adam
+from spike4dgs.method.gaussians.optimizer import Adam
 from spike4dgs.method.matching.config import MatcherConfig, MatcherTraining
 from spike4dgs.method.matching.network import Matcher
 from spike4dgs.method.matching.training.data import draw
@@ -60,7 +60,7 @@ class MatchTraining:
             live.train().requires_grad_(True)
             self.step, self.shards = card.steps, frozenset(card.trained_on)
         self.networks = nn.ModuleDict({"live": live, "mean": copy.deepcopy(live)})
-        self.adam = make_adam({"all": list(live.parameters())}, (0.9, 0.999))
+        self.adam = Adam({"all": list(live.parameters())}, (0.9, 0.999))
 
     @property
     def network(self) -> Matcher:
@@ -83,11 +83,11 @@ class MatchTraining:
         generator = seeded(self.seed, self.step)
         features = live.extractor(batch.inputs)
         losses = match_losses(live, features, batch.views, batch.pairs, self.settings.jitter, generator)
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
         losses.total.backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(live.parameters(), 1.0)
-        for group in self.adam.param_groups:
-            group["lr"] = self.settings.learning_rate(self.step, self.warm_steps)
+        for group in self.adam.groups:
+            group.lr = self.settings.learning_rate(self.step, self.warm_steps)
         if norm.isfinite():  # else the step is skipped: one bad sample must not ruin the network
             self.adam.step()
         self.step += 1

@@ -10,12 +10,12 @@ from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.optimizer import (
     MOMENTS,
+    Adam,
     Averages,
     Decay,
     WarmCosine,
     apply_edit,
     export_state,
-    make_adam,
     set_learning_rate,
     set_learning_rates,
 )
@@ -52,11 +52,11 @@ def mask(n: int, *rows: int) -> Tensor:
     return torch.zeros(n, dtype=torch.bool).index_fill(0, torch.tensor(rows), True)
 
 
-def trained(gaussians: Gaussians) -> tuple[Gaussians, torch.nn.Parameter, torch.optim.Adam]:
+def trained(gaussians: Gaussians) -> tuple[Gaussians, torch.nn.Parameter, Adam]:
     """Gaussians, something else beside them, and an optimiser whose moments differ in every row."""
     leaves, other = gaussians.trainable(), torch.nn.Parameter(torch.ones(3))
-    adam = make_adam({**{k: [v] for k, v in leaves.tensors().items()}, "grid": [other]}, (0.9, 0.99))
-    set_learning_rates(adam, {g["name"]: Decay(1e-3, 1e-3) for g in adam.param_groups}, 0.0)
+    adam = Adam({**{k: [v] for k, v in leaves.tensors().items()}, "grid": [other]}, (0.9, 0.99))
+    set_learning_rates(adam, {g.name: Decay(1e-3, 1e-3) for g in adam.groups}, 0.0)
     rng = torch.Generator().manual_seed(5)
     for _ in range(3):
         for p in [*leaves.tensors().values(), other]:
@@ -90,12 +90,12 @@ def test_every_rows_moments_are_those_of_the_row_that_it_continues(name: str) ->
             continue
         assert new[key].shape == after.tensors()[group].shape
         assert torch.equal(new[key][kept], value[edit.source[kept]]) and not new[key][~kept].any()
-    for group in adam.param_groups:
-        (parameter,) = group["params"]
-        assert parameter is (other if group["name"] == "grid" else after.tensors()[group["name"]])
+    for group in adam.groups:
+        (parameter,) = group.params
+        assert parameter is (other if group.name == "grid" else after.tensors()[group.name])
         assert parameter.is_leaf and parameter.requires_grad
         parameter.grad = torch.ones_like(parameter)
-    assert len(adam.state) == len(adam.param_groups)  # no memory of the old leaves
+    assert len(adam.state) == len(adam.groups)  # no memory of the old leaves
     adam.step()
     assert all(torch.isfinite(v).all() for v in after.tensors().values())
     assert not torch.equal(other, before)
@@ -216,15 +216,15 @@ def test_a_warm_cosine_rises_linearly_and_falls_to_nothing() -> None:
 
 
 def test_one_rate_is_set_for_all_groups() -> None:
-    adam = make_adam({name: [torch.zeros(1, requires_grad=True)] for name in ("a", "b")}, (0.9, 0.999))
+    adam = Adam({name: [torch.zeros(1, requires_grad=True)] for name in ("a", "b")}, (0.9, 0.999))
     set_learning_rate(adam, 0.25)
-    assert [group["lr"] for group in adam.param_groups] == [0.25, 0.25]
+    assert [group.lr for group in adam.groups] == [0.25, 0.25]
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_averages_are_plain_means_of_all_parameters(count: int) -> None:
     a, b = torch.zeros(5, 3, requires_grad=True), torch.zeros(2, requires_grad=True)
-    adam, averages, seen = make_adam({"a": [a], "b": [b]}, (0.9, 0.99)), Averages(), []
+    adam, averages, seen = Adam({"a": [a], "b": [b]}, (0.9, 0.99)), Averages(), []
     for n in range(1, count + 1):
         with torch.no_grad():
             a.copy_(torch.randn(a.shape, generator=torch.Generator().manual_seed(n)))

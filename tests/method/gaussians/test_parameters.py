@@ -9,11 +9,11 @@ from scipy.integrate import quad
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.gaussians.optimizer import (
+    Adam,
     Decay,
     apply_edit,
     export_state,
     import_state,
-    make_adam,
     set_learning_rates,
 )
 from spike4dgs.method.gaussians.parameters import MAX_COPIES, Gaussians, densify, from_points, nearest, relocate, share
@@ -29,9 +29,9 @@ def some(n: int, seed: int = 0) -> Gaussians:
     return g
 
 
-def trained(g: Gaussians, steps: int = 3) -> tuple[Gaussians, torch.optim.Adam]:
+def trained(g: Gaussians, steps: int = 3) -> tuple[Gaussians, Adam]:
     g = g.trainable()
-    adam = make_adam({k: [v] for k, v in g.tensors().items()}, (0.9, 0.99))
+    adam = Adam({k: [v] for k, v in g.tensors().items()}, (0.9, 0.99))
     for step in range(steps):
         set_learning_rates(adam, RATES, step / steps)
         adam.zero_grad()
@@ -40,7 +40,7 @@ def trained(g: Gaussians, steps: int = 3) -> tuple[Gaussians, torch.optim.Adam]:
     return g, adam
 
 
-def moments(adam: torch.optim.Adam, name: str) -> torch.Tensor:
+def moments(adam: Adam, name: str) -> torch.Tensor:
     return export_state(adam)[f"{name}.0.exp_avg"]
 
 
@@ -88,11 +88,36 @@ def test_densify_keeps_old_rows_and_moments_and_starts_new_ones_afresh():
     assert torch.equal(new.logits[10:], before["logits"][0][[0, 9, 0, 9]])
 
 
+def test_a_step_has_the_bits_of_torch_s_fused_adam():
+    def leaves() -> dict[str, list[torch.Tensor]]:
+        rng = torch.Generator().manual_seed(1)
+        return {
+            name: [torch.randn(shape, generator=rng, requires_grad=True) for shape in ((7, 3), (5,))]
+            for name in ("a", "b")
+        }
+
+    ours, theirs = leaves(), leaves()
+    adam = Adam(ours, (0.9, 0.99))
+    groups = [{"name": name, "params": params} for name, params in theirs.items()]
+    reference = torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    for step, rate in enumerate((0.1, 0.05, 0.0, 0.2)):
+        for optimiser, params in ((adam, ours), (reference, theirs)):
+            optimiser.zero_grad()
+            used = params["a"] + params["b"][: step % 3]  # a parameter without a gradient stays where it is
+            sum(((p - 1) ** 3).sum() for p in used).backward()
+        adam.groups[0].lr = reference.param_groups[0]["lr"] = rate
+        adam.groups[1].lr = reference.param_groups[1]["lr"] = rate / 3
+        adam.step()
+        reference.step()
+        for name in ours:
+            assert all(torch.equal(p, q) for p, q in zip(ours[name], theirs[name], strict=True)), (step, name)
+
+
 def test_optimiser_state_survives_export_and_import():
     g, adam = trained(some(5))
     copy, fresh = trained(some(5), steps=0)
     copy = g.trainable()
-    fresh = make_adam({k: [v] for k, v in copy.tensors().items()}, (0.9, 0.99))
+    fresh = Adam({k: [v] for k, v in copy.tensors().items()}, (0.9, 0.99))
     import_state(fresh, {k: v.clone() for k, v in export_state(adam).items()})
     for leaves, optimiser in ((g, adam), (copy, fresh)):
         set_learning_rates(optimiser, RATES, 0.5)

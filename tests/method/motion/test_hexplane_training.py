@@ -79,7 +79,7 @@ def test_learning_rates_fall_over_each_stage_and_follow_the_size_of_the_scene() 
     t, s, seen = trainer(), SETTINGS, []
     for _ in range(t.total):
         t.train_step()
-        seen.append({g["name"]: g["lr"] for g in t.adam.param_groups})
+        seen.append({g.name: g.lr for g in t.adam.groups})
     means = [rates["means"] for rates in seen]
     assert means[0] == means[3] == pytest.approx(3.0 * s.lr_means)  # both stages begin at the first rate
     ratio = s.lr_means_last / s.lr_means
