@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,15 +23,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.method.gaussians.parameters import Gaussians, nearest
 from spike4dgs.method.splat import Views
+from spike4dgs.method.splat.kernels import threads
 from spike4dgs.method.splat.kernels.jit import kernel
+from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
 CUBIC = 9  # m1, m2 and m3 of a path in space
 NEAREST = 6
 EASE = 0.1  # e, px: below it the pull weakens
 SHARES = (0.5,) * 3 + (0.25,) * 3 + (0.125,) * 3  # of m1, m2 and m3 half a clip away
+ITEM = 512  # Gaussians per work item
+_SHARES = np.asarray(SHARES, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,18 @@ class Neighbours:
 
     index: Tensor  # int64 [N, K]; K = 0 where there are too few Gaussians
     pixels: Tensor  # float32 [N], px per metre in the first view
+
+    @cached_property
+    def pulling(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Who pulls at each Gaussian, itself and those whose neighbour it is, ascending.
+
+        They are `second[first[i] : first[i + 1]]` for Gaussian i.
+        """
+        n, k = self.index.shape
+        pulled = np.concatenate([self.index.numpy().ravel(), np.arange(n)])
+        who = np.concatenate([np.repeat(np.arange(n), k), np.arange(n)])
+        first = np.concatenate([[0], np.bincount(pulled, minlength=n).cumsum()])
+        return first, who[np.lexsort((who, pulled))]
 
 
 class Coherence:
@@ -101,11 +117,14 @@ class _Incoherence(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, coefficients: Tensor, near: Neighbours) -> Tensor:
-        gradient = np.zeros(coefficients.shape, np.float32)
-        given = coefficients.detach().contiguous().numpy(), near.index.numpy(), near.pixels.numpy()
-        value = _sum(*given, np.asarray(SHARES, np.float32), np.float32(EASE), gradient)
+        m, index, pixels = coefficients.detach().contiguous().numpy(), near.index.numpy(), near.pixels.numpy()
+        own, others, gradient = (np.empty_like(m) for _ in range(3))
+        lengths = np.empty(len(m))
+        scratch = [()] * threads.useful_threads(len(m), 4 * ITEM)
+        threads.run(_departures, (m, index, pixels, _SHARES, np.float32(EASE), own, others, lengths), scratch)
+        threads.run(_gradient, (own, others, *near.pulling, gradient), scratch)
         ctx.save_for_backward(torch.from_numpy(gradient))
-        return torch.tensor(value, dtype=torch.float32)
+        return torch.tensor(lengths.sum(), dtype=torch.float32)
 
     @staticmethod
     def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor, None]:
@@ -113,31 +132,48 @@ class _Incoherence(torch.autograd.Function):
 
 
 @kernel
-def _sum(
-    m: Float32, index: NDArray[np.int64], pixels: Float32, shares: Float32, ease: np.float32, gradient: Float32
-) -> float:
-    """Return the sum and add its gradient; by one thread, as neighbours share what is written."""
-    departure = np.empty(CUBIC, np.float32)
-    part = np.float32(1 / NEAREST)
-    total = 0.0
-    for i in range(len(m)):
-        departure[:] = 0
-        for j in range(NEAREST):
-            at = index[i, j]
+def _departures(  # type: ignore[no-untyped-def]
+    m, index, pixels, shares, ease, own, others, lengths, counter
+):
+    """Fill each Gaussian's part of the sum, and its slopes in the Gaussian's and in each neighbour's coefficients."""
+    departure, part = np.empty(CUBIC, np.float32), np.float32(1 / NEAREST)
+    while True:
+        begin = fetch_add(counter, 0, 1) * ITEM
+        if begin >= len(m):
+            return
+        for i in range(begin, min(begin + ITEM, len(m))):
+            departure[:] = 0
+            for j in range(NEAREST):
+                at = index[i, j]
+                for c in range(CUBIC):
+                    departure[c] += m[at, c]
+            square = ease * ease
             for c in range(CUBIC):
-                departure[c] += m[at, c]
-        square = ease * ease
-        for c in range(CUBIC):
-            departure[c] = (m[i, c] - departure[c] * part) * shares[c] * pixels[i]
-            square += departure[c] * departure[c]
-        length = np.sqrt(square)
-        total += length - ease
-        for c in range(CUBIC):
-            slope = departure[c] * shares[c] * pixels[i] / length
-            gradient[i, c] += slope
-            departure[c] = slope * part
-        for j in range(NEAREST):
-            at = index[i, j]
+                departure[c] = (m[i, c] - departure[c] * part) * shares[c] * pixels[i]
+                square += departure[c] * departure[c]
+            length = np.sqrt(square)
+            lengths[i] = length - ease
             for c in range(CUBIC):
-                gradient[at, c] -= departure[c]
-    return total
+                own[i, c] = departure[c] * shares[c] * pixels[i] / length
+                others[i, c] = own[i, c] * part
+
+
+@kernel
+def _gradient(own, others, first, who, gradient, counter):  # type: ignore[no-untyped-def]
+    """Sum up each Gaussian's gradient over who pulls at it."""
+    total = np.empty(CUBIC, np.float32)
+    while True:
+        begin = fetch_add(counter, 0, 1) * ITEM
+        if begin >= len(own):
+            return
+        for i in range(begin, min(begin + ITEM, len(own))):
+            total[:] = 0
+            for k in range(first[i], first[i + 1]):
+                j = who[k]
+                if j == i:
+                    for c in range(CUBIC):
+                        total[c] += own[i, c]
+                else:
+                    for c in range(CUBIC):
+                        total[c] -= others[j, c]
+            gradient[i] = total

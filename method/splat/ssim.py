@@ -41,12 +41,13 @@ _C1, _C2, _TWO = np.float32(C1), np.float32(C2), np.float32(2)
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Return the mean SSIM of images [B, H, W] against targets [B, H, W], differentiable in `image`.
 
+    A pixel of `target` that is no number counts as met, and has no gradient.
     CPU tensors go through the kernels in float32, others through torch: the same formula with the window as a matrix.
     Raises UserError for other shapes, or for a target that wants a gradient, which the kernels do not give.
     """
     _check("ssim", image, target)
     if image.device.type != "cpu":
-        return _mean_ssim(image, target, _banded)
+        return _mean_ssim(*met(image, target), _banded)
     value: Tensor = _Fused.apply(image, target, 1.0, 0.0, _SHARP)  # type: ignore[no-untyped-call]
     return value
 
@@ -59,9 +60,17 @@ def l1_and_ssim(image: Tensor, target: Tensor, w: float, delta: float = 0.0) -> 
     """
     _check("l1_and_ssim", image, target)
     if image.device.type != "cpu":
+        image, target = met(image, target)
         return (1 - w) * huber(image, target, delta) + w * (1 - _mean_ssim(image, target, _banded))
     value: Tensor = _Fused.apply(image, target, -w, 1 - w, max(delta, _SHARP))  # type: ignore[no-untyped-call]
     return w + value
+
+
+def met(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both with the values of `image`, without gradient, where `target` is no number."""
+    if (finite := target.isfinite()).all():
+        return image, target
+    return torch.where(finite, image, image.detach()), torch.where(finite, target, image.detach())
 
 
 def huber(image: Tensor, target: Tensor, delta: float) -> Tensor:
@@ -134,7 +143,7 @@ class _Fused(torch.autograd.Function):
             (
                 np.zeros((height + 2 * RADIUS, width), np.float32),
                 np.zeros(width + 2 * RADIUS, np.float32),
-                np.empty((5, height, width), np.float32),
+                np.empty((6, height, width), np.float32),
             )
             for _ in range(workers)
         ]
@@ -208,20 +217,23 @@ def _loss_kernel(  # type: ignore[no-untyped-def]
 ):
     """Sums of SSIM and h(image - target) of each image, and their gradient with the `weights`, if it is wanted.
 
-    `gradients` is empty where it is not. The last of the weights are the delta of h and its inverse.
+    `gradients` is empty where it is not. The last of the weights are the delta of h and its inverse. SSIM's windows
+    would pull at pixels that nothing is known of, so a target that is no number becomes the image's own value.
     """
     batch, height, width = images.shape
     of_ssim, of_l1, delta, steep = weights
     one, half_of = np.float32(1), np.float32(0.5)
-    m1, m2, q1, q2, q12 = maps[0], maps[1], maps[2], maps[3], maps[4]
+    m1, m2, q1, q2, q12, b = maps[0], maps[1], maps[2], maps[3], maps[4], maps[5]
     while True:
         i = fetch_add(counter, 0, 1)
         if i >= batch:
             return
-        a, b = images[i], targets[i]
+        a, given = images[i], targets[i]
         total = 0.0
         for y in range(height):
             for x in range(width):
+                known = abs(given[y, x]) < np.float32(np.inf)
+                b[y, x] = given[y, x] if known else a[y, x]
                 q1[y, x] = a[y, x] * a[y, x]
                 q2[y, x] = b[y, x] * b[y, x]
                 q12[y, x] = a[y, x] * b[y, x]
@@ -259,4 +271,5 @@ def _loss_kernel(  # type: ignore[no-untyped-def]
                 for x in range(width):
                     d = a[y, x] - b[y, x]
                     slope = max(-one, min(one, d * steep))
-                    g[y, x] = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x] + of_l1 * slope
+                    slope = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x] + of_l1 * slope
+                    g[y, x] = slope if abs(given[y, x]) < np.float32(np.inf) else np.float32(0)

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from torch import Tensor, nn
 
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.settings import Settings
-from spike4dgs.method.splat.ssim import huber, l1_and_ssim
+from spike4dgs.method.splat.ssim import huber, l1_and_ssim, met
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +56,4 @@ def difference(rendered: Tensor, image: Tensor, w: float, delta: float = 0.0) ->
 
     A pixel of `image` that is no number counts as met, and has no gradient.
     """
-    if not (finite := image.isfinite()).all():  # otherwise SSIM's windows would pull at pixels that nothing is known of
-        met = rendered.detach()
-        rendered, image = torch.where(finite, rendered, met), torch.where(finite, image, met)
-    return l1_and_ssim(rendered, image, w, delta) if w else huber(rendered, image, delta)
+    return l1_and_ssim(rendered, image, w, delta) if w else huber(*met(rendered, image), delta)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -47,15 +48,21 @@ class TrainingImages:
 
     def measured(self, index: int, views: Sequence[int] | slice = slice(None)) -> Tensor:
         """Return the images [V, H, W] of some views at one time for a loss: NaN where nothing was measured."""
-        image = self.images[index][views]
+        image, unmeasured = self.images[index][views], self._unmeasured
+        return image if unmeasured is None else image.masked_fill(unmeasured[index][views], math.nan)
+
+    @cached_property
+    def _unmeasured(self) -> Tensor | None:
+        """Where nothing was measured, bool [T, C, H, W]: made once, as a fit asks in each step."""
+        masks = []
         if self.bad is not None:
-            image = image.masked_fill(self.bad[views], math.nan)
+            masks.append(self.bad)
         if self.missing is not None:
-            image = image.masked_fill(self.missing[index][views][:, None, None], math.nan)
+            masks.append(self.missing[..., None, None])
         if self.spans is not None:  # before a pixel's first spike and after its last, a span is of another time
-            first, last = self.spans.at(index).ends[views].unbind(1)
-            image = image.masked_fill((first > 0) | (last < 0), math.nan)
-        return image
+            first, last = self.spans.ends.unbind(2)
+            masks.append((first > 0) | (last < 0))
+        return reduce(torch.logical_or, masks).expand(self.images.shape) if masks else None
 
     def at(self, index: int) -> TrainingImages:
         """Return the images of one time alone."""
