@@ -13,7 +13,7 @@ from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.streams import DAT_FILE, DatFile, open_streams
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.benchmark.spikes.bad_pixels import total_counts
+from spike4dgs.benchmark.spikes.counted_recording import total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import trains_bytes

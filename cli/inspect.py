@@ -19,7 +19,8 @@ from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad, total_counts
+from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad
+from spike4dgs.benchmark.spikes.counted_recording import total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.cli.options import warn_of_size

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spike4dgs.benchmark.arrays import Float64, Int64, Mask
+from spike4dgs.benchmark.arrays import Float64, Mask
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.counted_recording import WINDOW_TICKS, Recording
+from spike4dgs.benchmark.spikes.counted_recording import WINDOW_TICKS, Recording, total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -23,7 +23,6 @@ HOT_SIGMA = 6.0  # robust standard deviations of its surroundings that a hot pix
 HOT_SHARE = 0.5  # and share of that neighbour's rate: texture of one pixel seldom has more
 FLICKER_FACTOR = 4.0  # times the usual deviation of counts that a flickering pixel has,
 FLICKER_LEAST = 1.0  # and at least so many spikes: steady light's counts differ by one, which deviates by a half
-_LONGEST_WINDOW = 60000  # ticks per count image: counts are 16 bits wide
 _ROWS = 100  # compared with their surroundings at a time
 
 
@@ -45,15 +44,6 @@ class BadPixels:
     def all(self) -> Mask:
         """The pixels that are bad in any way."""
         return self.dead | self.hot | self.flickering
-
-
-def total_counts(stream: Recording) -> Int64:
-    """Return the spikes per pixel of a whole stream [H, W]."""
-    counts = np.zeros((stream.height, stream.width), np.int64)
-    for start in range(0, stream.n_ticks, _LONGEST_WINDOW):
-        counts += stream.counts(start, min(start + _LONGEST_WINDOW, stream.n_ticks))
-    stream.release()
-    return counts
 
 
 def find_bad(stream: SpikeStream, flat: Recording | None = None, dark: Recording | None = None) -> BadPixels:

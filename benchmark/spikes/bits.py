@@ -28,7 +28,7 @@ from spike4dgs.benchmark.environment import available_cores
 F = TypeVar("F", bound=Callable[..., Any])
 
 _BLOCK = 1024  # bytes of a tick counted at a time: eight planes and a carry of 1 KiB each stay in the L1 cache
-_SMALL = 1 << 21  # bytes of input below which starting threads costs more than it saves
+SMALL = 1 << 21  # bytes of input below which starting threads costs more than it saves
 
 
 def kernel(function: F) -> F:
@@ -74,7 +74,7 @@ def lanes(width: int) -> UInt64:
 def count_bits(packed: UInt8, n_pixels: int) -> NDArray[np.uint16]:
     """Sum over ticks of each of the first `n_pixels` bits of rows [n, bytes] -> [n_pixels] uint16, n <= 65535."""
     counts = np.zeros(packed.shape[1] * 8, np.uint16)
-    in_threads(_count, packed.shape[1], rows(packed), lanes(2), counts, small=packed.size < _SMALL)
+    in_threads(_count, packed.shape[1], rows(packed), lanes(2), counts, small=packed.size < SMALL)
     return counts[:n_pixels]
 
 
@@ -116,7 +116,7 @@ def copy_into(source: NDArray[Any], target: NDArray[Any]) -> None:
 def unpack(packed: UInt8, width: int, height: int, flip: bool) -> UInt8:
     """Unpack rows [n, bytes] to [n, height, width] of 0 and 1, with the rows in reverse order if `flip`."""
     out = np.empty((len(packed), height, width), np.uint8)
-    small = packed.size < _SMALL // 8
+    small = packed.size < SMALL // 8
     if width % 8 == 0:
         in_threads(_unpack_bytes, len(packed), rows(packed), lanes(1)[:, 0], flip, out.view(np.uint64), small=small)
     else:

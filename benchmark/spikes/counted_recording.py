@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Int32, Int64, UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.bits import kernel, rows
+from spike4dgs.benchmark.spikes.bits import SMALL, in_threads, kernel, rows
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.untrusted import read_npz
 
+_MOST = 60_000  # ticks counted at once, whole windows: a stream's counts are 16 bits wide
 WINDOW_TICKS = 50  # of a flickering pixel's counts: a state that holds for a few milliseconds shows
 _AGAIN = "restore it or make the scene again"
 
@@ -96,29 +97,43 @@ def first_last_total(recording: Recording) -> tuple[Int64, Int64, Int64]:
     """Return the ticks of each pixel's first and last spike (-1: none), and the number of its spikes, each [H, W]."""
     if isinstance(recording, CountedRecording):
         return tuple(x.astype(np.int64) for x in (recording.first, recording.last, recording.total))  # type: ignore[return-value]
-    n = recording.width * recording.height
-    first, last, total = np.full(n, -1, np.int64), np.full(n, -1, np.int64), np.zeros(n, np.int64)
-    _first_last_total(rows(recording.packed), first, last, total)
-    recording.release()
-    images = [x.reshape(recording.height, recording.width) for x in (first, last, total)]
-    return tuple(x[::-1] if recording.rows_bottom_up else x for x in images)  # type: ignore[return-value]
+    packed = rows(recording.packed)
+    first, last = (np.full(8 * packed.shape[1], -1, np.int64) for _ in range(2))
+    for back, found in ((False, first), (True, last)):
+        in_threads(_meet, packed.shape[1], packed, back, found, small=packed.size < SMALL)
+    images = [x[: recording.width * recording.height].reshape(recording.height, recording.width) for x in (first, last)]
+    first, last = (x[::-1] if recording.rows_bottom_up else x for x in images)
+    return first, last, total_counts(recording)
+
+
+def total_counts(stream: Recording) -> Int64:
+    """Return the spikes per pixel of a whole stream [H, W]."""
+    counts = np.zeros((stream.height, stream.width), np.int64)
+    for start in range(0, stream.n_ticks, _MOST):
+        counts += stream.counts(start, min(start + _MOST, stream.n_ticks))
+    stream.release()
+    return counts
 
 
 @kernel
-def _first_last_total(packed: Any, first: Any, last: Any, total: Any) -> None:
-    """Fill the ticks of the first and last spike and the spikes of every pixel [P], from packed rows [T, bytes]."""
-    for tick in range(len(packed)):
-        for byte in range(packed.shape[1]):
-            bits = packed[tick, byte]
-            if bits == 0:
-                continue
-            for k in range(8):
-                pixel = 8 * byte + k
-                if pixel < len(total) and (bits >> k) & 1:
-                    if total[pixel] == 0:
-                        first[pixel] = tick
-                    last[pixel] = tick
-                    total[pixel] += 1
+def _meet(packed: Any, back: bool, found: Any, start: int, stop: int) -> None:
+    """Fill the tick of the first spike that each pixel of bytes [start, stop) has, or coming `back` from the last tick.
+
+    `packed` has rows [T, bytes].
+    """
+    met, left = np.zeros(stop - start, np.uint8), stop - start
+    for t in range(len(packed)):
+        tick = len(packed) - 1 - t if back else t
+        for byte in range(start, stop):
+            new = packed[tick, byte] & ~met[byte - start]
+            if new:
+                met[byte - start] |= new
+                left -= met[byte - start] == 255
+                for k in range(8):
+                    if (new >> k) & 1:
+                        found[8 * byte + k] = tick
+        if not left:
+            return
 
 
 def raw(recording: Recording) -> SpikeStream:

@@ -16,7 +16,8 @@ import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, total_counts
+from spike4dgs.benchmark.spikes.bad_pixels import BadPixels
+from spike4dgs.benchmark.spikes.counted_recording import total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.starts.clip import SpikeClip

@@ -13,7 +13,8 @@ from spike4dgs.benchmark.arrays import Mask
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad, total_counts
+from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad
+from spike4dgs.benchmark.spikes.counted_recording import total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.repair import LONGEST_TICKS, fill_gaps, fill_pixels
 from spike4dgs.method.recordings.camera_facts import between_views, from_recordings

@@ -17,7 +17,7 @@ from memory import STATUS, resident_bytes
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.held_out_spikes import response_of
 from spike4dgs.benchmark.scene.calibration import Recordings, estimate
-from spike4dgs.benchmark.spikes.bad_pixels import deviation, find_bad, total_counts
+from spike4dgs.benchmark.spikes.bad_pixels import deviation, find_bad
 from spike4dgs.benchmark.spikes.counted_recording import (
     CountedRecording,
     counted,
@@ -25,6 +25,7 @@ from spike4dgs.benchmark.spikes.counted_recording import (
     first_last_total,
     open_counted,
     raw,
+    total_counts,
 )
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.repair import fill_pixels
@@ -94,6 +95,18 @@ def test_counts_are_those_of_plain_arrays(seed: int, ticks: int, bottom_up: bool
         for stop in {*range(start, ticks, 50), ticks}:
             np.testing.assert_array_equal(found.counts(start, stop), spikes[start:stop].sum(axis=0))
     np.testing.assert_array_equal(total_counts(found), spikes.sum(axis=0))
+
+
+def test_first_and_last_spikes_of_a_long_recording_are_those_of_plain_arrays() -> None:
+    """Long enough for several threads; some pixels never fire."""
+    rng = np.random.default_rng(5)
+    spikes = rng.random((2048, 8800), np.float32) < rng.choice([0.0, 0.0005, 0.01, 0.4], 8800)
+    first, last, total = first_last_total(SpikeStream(pack(spikes.reshape(2048, 80, 110)), 110, 80, 20_000.0))
+    fires = spikes.any(axis=0)
+    assert 0 < fires.sum() < len(fires)
+    np.testing.assert_array_equal(first.ravel(), np.where(fires, spikes.argmax(axis=0), -1))
+    np.testing.assert_array_equal(last.ravel(), np.where(fires, 2047 - spikes[::-1].argmax(axis=0), -1))
+    np.testing.assert_array_equal(total.ravel(), spikes.sum(axis=0))
 
 
 def test_other_windows_need_the_raw_recording() -> None:
