@@ -141,7 +141,7 @@ def _render(
 
 def _score(motion: Motion, gaussians: Gaussians, images: TrainingImages, view: int, index: int) -> float:
     _, image = _render(motion, gaussians, images, view, images.ticks[index] / images.n_ticks)
-    return float(ssim(image[None], known(images.images[index, view], image)[None]))
+    return float(ssim(image[None], images.images[index, view][None]))
 
 
 def bad_pixels(rendered: Tensor, image: Tensor) -> Tensor:

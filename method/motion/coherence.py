@@ -25,15 +25,14 @@ from torch import Tensor
 
 from spike4dgs.method.gaussians.parameters import Gaussians, nearest
 from spike4dgs.method.splat import Views
-from spike4dgs.method.splat.kernels import threads
 from spike4dgs.method.splat.kernels.jit import kernel
+from spike4dgs.method.splat.kernels.threads import ITEM, run_items
 from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
 CUBIC = 9  # m1, m2 and m3 of a path in space
 NEAREST = 6
 EASE = 0.1  # e, px: below it the pull weakens
 SHARES = (0.5,) * 3 + (0.25,) * 3 + (0.125,) * 3  # of m1, m2 and m3 half a clip away
-ITEM = 512  # Gaussians per work item
 _SHARES = np.asarray(SHARES, np.float32)
 
 
@@ -120,9 +119,8 @@ class _Incoherence(torch.autograd.Function):
         m, index, pixels = coefficients.detach().contiguous().numpy(), near.index.numpy(), near.pixels.numpy()
         own, others, gradient = (np.empty_like(m) for _ in range(3))
         lengths = np.empty(len(m))
-        scratch = [()] * threads.useful_threads(len(m), 4 * ITEM)
-        threads.run(_departures, (m, index, pixels, _SHARES, np.float32(EASE), own, others, lengths), scratch)
-        threads.run(_gradient, (own, others, *near.pulling, gradient), scratch)
+        run_items(_departures, (m, index, pixels, _SHARES, np.float32(EASE), own, others, lengths), len(m))
+        run_items(_gradient, (own, others, *near.pulling, gradient), len(m))
         ctx.save_for_backward(torch.from_numpy(gradient))
         return torch.tensor(lengths.sum(), dtype=torch.float32)
 

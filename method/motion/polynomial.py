@@ -26,8 +26,8 @@ from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.motion.coherence import CUBIC
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Splats
-from spike4dgs.method.splat.kernels import threads
 from spike4dgs.method.splat.kernels.jit import kernel
+from spike4dgs.method.splat.kernels.threads import ITEM, run_items
 from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
 
@@ -119,8 +119,6 @@ def move_to(gaussians: Gaussians, times: Tensor) -> Gaussians:
     return replace(gaussians, means=means, quats=quats, extra={**extra, "coefficients": moved, "times": times})
 
 
-ITEM = 1024  # Gaussians per work item
-
 Four = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
@@ -134,17 +132,13 @@ def at_time_cpu(tensors: tuple[Tensor, ...], t: float) -> Four:
     return out
 
 
-def _scratch(n: int) -> list[tuple[()]]:
-    return [()] * threads.useful_threads(n, 4 * ITEM)
-
-
 class _AtTime(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, t: float, *tensors: Tensor) -> Four:
         ctx.t, ctx.arrays = np.float32(t), tuple(x.detach().contiguous().numpy() for x in tensors)
         means, log_scales, quats, logits = ctx.arrays[:4]
         out = np.empty_like(means), np.empty_like(quats), np.empty_like(log_scales), np.empty_like(logits)
-        threads.run(_forward, (ctx.t, *ctx.arrays, *out), _scratch(len(means)))
+        run_items(_forward, (ctx.t, *ctx.arrays, *out), len(means))
         ctx.scales = out[2]
         at_t = tuple(torch.from_numpy(x) for x in out)
         return at_t[0], at_t[1], at_t[2], at_t[3]
@@ -156,7 +150,7 @@ class _AtTime(torch.autograd.Function):
         own = tuple(np.empty_like(x) for x in (log_scales, logits, times, durations, coefficients, turning))
         given = (x.numpy() for x in (d_means, d_quats, d_scales, d_opacities))
         arguments = (ctx.t, logits, times, durations, ctx.scales, *given, *own)
-        threads.run(_backward, arguments, _scratch(len(times)))
+        run_items(_backward, arguments, len(times))
         d_log_scales, *rest = (torch.from_numpy(x) for x in own)
         return None, d_means, d_log_scales, d_quats, *rest
 

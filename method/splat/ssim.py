@@ -271,5 +271,5 @@ def _loss_kernel(  # type: ignore[no-untyped-def]
                 for x in range(width):
                     d = a[y, x] - b[y, x]
                     slope = max(-one, min(one, d * steep))
-                    slope = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x] + of_l1 * slope
-                    g[y, x] = slope if abs(given[y, x]) < np.float32(np.inf) else np.float32(0)
+                    pull = m1[y, x] + _TWO * a[y, x] * q1[y, x] + b[y, x] * q12[y, x] + of_l1 * slope
+                    g[y, x] = pull if b[y, x] == given[y, x] else np.float32(0)

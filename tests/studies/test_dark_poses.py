@@ -66,15 +66,13 @@ def test_the_table_has_shares_of_pairs_in_each_condition(
         write_toy_shard(tmp_path, variant, width=96, height=61, resting=2)
     monkeypatch.setattr(dark, "LIGHTS", (1.0, 1 / 4096))
     monkeypatch.setattr(dark, "TICKS", (41,))
-    some = {name: ESTIMATORS[name] for name in list(ESTIMATORS)[:3]}  # one of those by COLMAP
-    monkeypatch.setattr(dark, "ESTIMATORS", some)
     assert dark_poses(tmp_path, bursts=1, out=tmp_path / "out") == 0
     rows = json.loads((tmp_path / "out" / "poses.json").read_text())["rows"]
-    assert [row["world"] for row in rows] == ["toy-12"] * 2 * len(some)
+    assert [row["world"] for row in rows] == ["toy-12"] * 2 * len(ESTIMATORS)
     assert all(len(row["rotation_deg"]) == len(row["direction_deg"]) == 28 for row in rows)
     _, _, bright, black = (tmp_path / "out" / "poses.md").read_text().splitlines()
-    assert bright == "| 1 | 2 |" + " 100 % / 100 % |" * len(some)  # within 1 and 5 degrees
-    assert black == "| 1/4096 | 2 |" + " 0 % / 0 % |" * len(some)
+    assert bright == "| 1 | 2 |" + " 100 % / 100 % |" * len(ESTIMATORS)  # within 1 and 5 degrees
+    assert black == "| 1/4096 | 2 |" + " 0 % / 0 % |" * len(ESTIMATORS)
     assert (tmp_path / "out" / "poses.png").stat().st_size > 1000
     assert "1/1 arrays" in capsys.readouterr().out
     monkeypatch.setattr(dark, "see", None)  # an array that is done is not measured again

@@ -16,6 +16,7 @@ import numpy as np
 from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import problem
 
+ITEM = 1024  # Gaussians that a thread takes at a time, where they are small work
 _threads = min(available_cores(), 16)
 _tasks: SimpleQueue[_Task | None] | None = None  # of the helpers, which are started with the first of them
 _lock = threading.Lock()
@@ -63,6 +64,11 @@ def aligned(shape: tuple[int, ...], dtype: type) -> np.ndarray:
     raw = np.empty(size + 64, np.uint8)
     start = -raw.__array_interface__["data"][0] % 64  # ctypes.data takes 30 times as long
     return raw[start : start + size].view(dtype).reshape(shape)
+
+
+def run_items(kernel: Any, arguments: Sequence[Any], items: int) -> None:
+    """Call `kernel(*arguments, counter)` on as many threads as `items` are worth; it takes `ITEM` at a time."""
+    run(kernel, arguments, [()] * useful_threads(items, 4 * ITEM))
 
 
 def run(kernel: Any, arguments: Sequence[Any], scratch: Sequence[Sequence[Any]]) -> None:
