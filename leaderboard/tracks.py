@@ -124,6 +124,11 @@ def _check_frozen(folder: Path, path: Path) -> None:
         raise problem(path, f"the bytes whose hash {sums.name} lists", f"sha256 {found[:16]}...", _FROZEN)
 
 
+def fingerprint_path(scene: str, revision: str) -> Path:
+    """Return where the current release has the fingerprint of a scene, if it has one."""
+    return FOLDER / RELEASE / f"{scene_name(scene, revision)}.npz"
+
+
 def match_release(scene: Scene) -> Match | None:
     """Return how a scene compares with the current release's of the same id by its fingerprint, the nearest of several.
 
@@ -134,8 +139,7 @@ def match_release(scene: Scene) -> Match | None:
         return None
     found = []
     for revision in known:
-        path = FOLDER / RELEASE / f"{scene_name(scene.id, revision)}.npz"
-        if path.is_file():
+        if (path := fingerprint_path(scene.id, revision)).is_file():
             _check_frozen(FOLDER, path)
             match = compare(scene, read_fingerprint(path))
             found += [match] if match.revision == revision else []

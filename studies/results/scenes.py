@@ -1,6 +1,7 @@
 """The scenes of a sweep: known by their revisions and, where another processor made them, by their fingerprints.
 
-RECORDS/scenes/SCENE.npz is the fingerprint of the scene that the first record of it was measured on.
+RECORDS/scenes/SCENE.npz is the fingerprint of the scene that the first record of it was measured on. Of a scene of the
+current release it is with the release.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from rich.console import Console
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.release.fingerprint import compare, make_fingerprint, read_fingerprint, write_fingerprint
 from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.leaderboard.tracks import fingerprint_path
 from spike4dgs.studies.results.records import DIGITS, Record
 
 
@@ -25,13 +27,19 @@ def revisions_of(scenes: Iterable[Scene], records: Iterable[Record], folder: Pat
     known = {record["scene"]: record["revision"] for record in records}
     found: dict[str, str] = {}
     for scene in scenes:
-        path, own = folder / "scenes" / f"{scene.id}.npz", scene.revision[:DIGITS]
+        own = scene.revision[:DIGITS]
         found[scene.id] = known.get(scene.id, own)
+        path = _fingerprint(folder, scene.id, found[scene.id])
         if found[scene.id] != own:
             _check_equivalent(scene, found[scene.id], path, console)
         elif scene.id not in known or not path.is_file():
             write_fingerprint(path, make_fingerprint(scene))
     return found
+
+
+def _fingerprint(folder: Path, scene: str, revision: str) -> Path:
+    released = fingerprint_path(scene, revision)
+    return released if released.is_file() else folder / "scenes" / f"{scene}.npz"
 
 
 def _check_equivalent(scene: Scene, revision: str, path: Path, console: Console) -> None:

@@ -29,6 +29,7 @@ from spike4dgs.benchmark.method import Method
 from spike4dgs.benchmark.release.fingerprint import compare, read_fingerprint, write_fingerprint
 from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.leaderboard import tracks
 from spike4dgs.studies.results import code_state as states
 from spike4dgs.studies.results.code_state import CodeState, check_clean, code_digest, code_state
 from spike4dgs.studies.results.command import Choice, results
@@ -201,6 +202,20 @@ def test_a_scene_of_another_processor_joins_the_records_where_it_differs_by_roun
     write_fingerprint(path, replace(made, revision="f" * 64, arrays=spikes))
     with pytest.raises(UserError, match="expected revision ffffffffffff.*spikes"):
         swept(folder, cells("b"), methods)
+
+
+def test_a_released_scene_is_known_by_the_releases_fingerprint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    methods = {"a": CountMethod("a")}
+    swept(folder, cells("a"), methods)
+    own, released = folder / "records/scenes/pattern-0.npz", folder / tracks.RELEASE / f"pattern-0@{'f' * 12}.npz"
+    released.parent.mkdir()
+    write_fingerprint(released, replace(read_fingerprint(own), revision="f" * 64))
+    own.unlink()
+    monkeypatch.setattr(tracks, "FOLDER", folder)
+    kept = read_records(folder / "records").values()
+    write_row(folder / "records", "a", [{**r, "revision": "f" * 12} for r in kept])
+    assert "0.0000% of its spike bits" in swept(folder, cells("a"), methods)[2]
+    assert not own.exists()
 
 
 @pytest.mark.parametrize(
