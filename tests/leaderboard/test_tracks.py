@@ -34,7 +34,7 @@ def test_the_shipped_release_has_the_tracks_and_its_frozen_bytes() -> None:
     files = [path for pattern in ("*.json", "*/*.npz") for path in tracks.FOLDER.glob(pattern)]
     found = {p.relative_to(tracks.FOLDER).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
     assert {line[66:]: line[:64] for line in listed} == found
-    assert {t.name for t in current_release().tracks if t.announced} == {"small", "paper"}
+    assert {t.name for t in current_release().tracks if t.announced} == {"paper"}
     every = {(s, r) for t in current_release().tracks for s, r in t.scenes.items() if r is not None}
     assert {f"2/{tracks.scene_name(*pair)}.npz" for pair in every} <= found.keys(), "each scene has a fingerprint"
     assert {tracks.scene_name(*pair) for pair in every} == set(current_release().ceilings_db)
