@@ -46,8 +46,8 @@ def test_an_empty_folder_has_the_published_entries(
     assert main(["leaderboard"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("published entries of release 2") and "42.68" in out
-    assert main(["leaderboard", "--track", "small"]) == 2
-    assert "a track with entries, found small, which has none yet; choose one of ideal" in capsys.readouterr().err
+    assert main(["leaderboard", "--track", "paper"]) == 2
+    assert "a track with entries, found paper, which has none yet; choose one of ideal" in capsys.readouterr().err
     assert main(["leaderboard", "--track", "outdor"]) == 2
     assert "expected one of ideal, no-flat-field, " in capsys.readouterr().err
 
