@@ -29,17 +29,14 @@ def revisions_of(scenes: Iterable[Scene], records: Iterable[Record], folder: Pat
     for scene in scenes:
         own = scene.revision[:DIGITS]
         found[scene.id] = known.get(scene.id, own)
-        path = _fingerprint(folder, scene.id, found[scene.id])
+        path = fingerprint_path(scene.id, found[scene.id])
+        if not path.is_file():
+            path = folder / "scenes" / f"{scene.id}.npz"
+            if found[scene.id] == own and not (scene.id in known and path.is_file()):
+                write_fingerprint(path, make_fingerprint(scene))
         if found[scene.id] != own:
             _check_equivalent(scene, found[scene.id], path, console)
-        elif scene.id not in known or not path.is_file():
-            write_fingerprint(path, make_fingerprint(scene))
     return found
-
-
-def _fingerprint(folder: Path, scene: str, revision: str) -> Path:
-    released = fingerprint_path(scene, revision)
-    return released if released.is_file() else folder / "scenes" / f"{scene}.npz"
 
 
 def _check_equivalent(scene: Scene, revision: str, path: Path, console: Console) -> None:

@@ -216,6 +216,12 @@ def test_a_released_scene_is_known_by_the_releases_fingerprint(folder: Path, mon
     write_row(folder / "records", "a", [{**r, "revision": "f" * 12} for r in kept])
     assert "0.0000% of its spike bits" in swept(folder, cells("a"), methods)[2]
     assert not own.exists()
+    (folder / "records/a.json").unlink()
+    revision = open_scene(folder / "pattern-0").revision
+    of_release = released.with_name(f"pattern-0@{revision[:12]}.npz")
+    of_release.write_bytes(b"as it was frozen")  # a sweep without records leaves it alone
+    swept(folder, cells("a"), methods)
+    assert of_release.read_bytes() == b"as it was frozen" and not own.exists()
 
 
 @pytest.mark.parametrize(
