@@ -24,7 +24,8 @@ class ImagePair:
 
     `where` names the image for errors; the prediction is multiplied by `gain` before anything else. `earlier` is the
     target of the same camera before this one, `since_ms` the time between them. `spikes` are those that the held-out
-    camera recorded around the target, where it did. A truth that is not known is NaN: only metrics that do not use it
+    camera recorded around the target, where it did. `covisible` are the pixels [H, W] of `covisible.covisible`, where
+    they are known. A truth that is not known is NaN: only metrics that do not use it
     are then computed.
     """
 
@@ -36,6 +37,7 @@ class ImagePair:
     earlier: ImagePair | None = None
     since_ms: float = math.nan
     spikes: SpikeView | None = None
+    covisible: Mask | None = None
 
     @cached_property
     def truth(self) -> Float64:

@@ -76,6 +76,7 @@ Values = dict[str, float | None]  # metric id -> value, None where there is none
 _NONE = {  # there is no value for any image
     Images.EVERY: "no image has a value",
     Images.MOVING: "no image has a moving region",
+    Images.COVISIBLE: "the scene has no depth of its cameras",
     Images.LATER: "no camera has two targets",
     Images.RECORDED: "no image has its ticks recorded",
     Images.RECORDED_MOVING: "no image has a moving region and its ticks recorded",

@@ -29,6 +29,7 @@ class Images(Enum):
 
     EVERY = "images"
     MOVING = "images that have a moving region"
+    COVISIBLE = "images of cameras whose depth the scene has"
     LATER = "images that have an earlier one of their camera"
     RECORDED = "images around which the camera recorded every tick"
     RECORDED_MOVING = "images with a moving region around which the camera recorded every tick"

@@ -7,7 +7,8 @@ A metric takes one of three kinds of input:
 - `spikes`: linear radiance beside the spikes that the held-out camera itself recorded; no image of the truth.
 
 The `*_aligned` metrics multiply the prediction by one least-squares gain per scene, which forgives a method that does
-not know the exposure. The `*_dynamic` metrics use only the moving region that the dataset marks. Metrics of linear
+not know the exposure. The `*_dynamic` metrics use only the moving region that the dataset marks; `psnr_covisible`
+leaves out what fewer than two training cameras see. Metrics of linear
 images are always computed. The others are computed where the machine has their weights, or only those asked for.
 
 JSON has no infinity: identical images, whose PSNR is infinite, count as `MAX_PSNR_DB`, and the record says so.
@@ -19,6 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from spike4dgs.benchmark.metrics.covisible import CAMERAS
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.lpips import TRUNKS, lpips
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric, psnr_db
@@ -40,6 +42,12 @@ def _psnr_dynamic(pair: ImagePair) -> float | None:
     if not pair.moving.any():
         return None
     return psnr_db((pair.truth[pair.moving] - pair.prediction[pair.moving]) ** 2)
+
+
+def _psnr_covisible(pair: ImagePair) -> float | None:
+    if pair.covisible is None or not (region := pair.covisible | pair.moving).any():
+        return None
+    return psnr_db((pair.truth[region] - pair.prediction[region]) ** 2)
 
 
 def _ssim_dynamic(pair: ImagePair) -> float | None:
@@ -127,6 +135,19 @@ _BASE = (
         measure=_ssim_dynamic,
         images=Images.MOVING,
     ),
+)
+_COVISIBLE = Metric(
+    id="psnr_covisible",
+    title="PSNR, co-visible",
+    definition=f"10 log10(1 / MSE) over the pixels that {CAMERAS} or more training cameras see, by the scene's depth "
+    f"maps, and those of the moving region; no error counts as {MAX_PSNR_DB:g} dB",
+    higher_is_better=True,
+    implementation="-10 * log10(mean((truth - prediction)[covisible | moving] ** 2)); benchmark/metrics/covisible.py",
+    measure=_psnr_covisible,
+    unit="dB",
+    digits=2,
+    images=Images.COVISIBLE,
+    added_later=True,
 )
 
 
@@ -222,7 +243,7 @@ _PERCEPTUAL = (
 )
 
 METRICS: dict[str, Metric] = Table(
-    "metrics", {m.id: m for m in (*_BASE, *map(_aligned, _BASE), *_PERCEPTUAL, *SPIKE_METRICS)}
+    "metrics", {m.id: m for m in (*_BASE, *map(_aligned, _BASE), _COVISIBLE, *_PERCEPTUAL, *SPIKE_METRICS)}
 )
 PRIMARY = "psnr"  # what the leaderboard ranks by
 MAIN = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # what a short table or line shows

@@ -1,4 +1,4 @@
-"""Score a predictions folder. Reads only files: images, the scene's truth, masks and held-out spikes; never a model."""
+"""Score a predictions folder. Reads only files: images, the scene's truth, masks, depth and held-out spikes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from spike4dgs.benchmark.arrays import Mask
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.metrics.covisible import covisible
 from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, check_images
 from spike4dgs.benchmark.metrics.measure import Selection, fit_gain, measure, scene_means, scene_notes, select_metrics
 from spike4dgs.benchmark.runs.held_out import Cameras, has_truth, open_cameras, targets_of, view_of, without_truth
@@ -33,8 +34,10 @@ def score_scene(predictions: Predictions, scene: Scene, selection: Selection, wi
     gain = None
     if compare:
         gain = fit_gain((p.truth_radiance, p.predicted_radiance) for _, p in _pairs(predictions, scene, {}, True))
+    masks = covisible(scene) if compare else {}
     measured = {
-        t.name: measure(pair, gain, selection.metrics) for t, pair in _pairs(predictions, scene, cameras, compare)
+        t.name: measure(replace(pair, covisible=masks.get(t.camera)), gain, selection.metrics)
+        for t, pair in _pairs(predictions, scene, cameras, compare)
     }
     per_image = {name: m.values for name, m in measured.items()}
     return {

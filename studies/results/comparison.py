@@ -59,6 +59,13 @@ class MeasuredRow:
         values = self.values(metric)
         return None if values is None else float(np.mean([scene.mean() for scene in values]))
 
+    def variance(self, metric: str) -> float | None:
+        """Return the variance between seeds, its mean over scenes; None where a value is missing, and for one seed."""
+        values = self.values(metric)
+        if values is None or len(self.seeds) < 2:
+            return None
+        return float(np.mean([np.var(scene, ddof=1) for scene in values]))
+
     def mean_cost(self, name: str) -> float | None:
         """Return the mean of a cost; None where a cell has none."""
         found = [self.cells[scene, seed][name] for scene in self.scenes for seed in self.seeds]

@@ -14,6 +14,7 @@ from spike4dgs.studies.results.plan import TABLE1, TABLE2, TABLE3, TABLE4, TABLE
 from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.breaks import breaks_block
 from spike4dgs.studies.results.tables.conditions import conditions_block, content_block
+from spike4dgs.studies.results.tables.covisible import covisible_block
 from spike4dgs.studies.results.tables.images import images_block
 from spike4dgs.studies.results.tables.modality import modality_block, noisy_block
 from spike4dgs.studies.results.tables.parts import own_scenes_block, parts_block
@@ -26,6 +27,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "breaks": breaks_block,
     "cameras": cameras_block,
     "content": content_block,
+    "covisible": covisible_block,
     "headline": lambda records: headline_block(NINE, records),
     "home": home_block,
     "lead": lambda records: lead_block(NINE, records),

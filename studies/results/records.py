@@ -15,7 +15,17 @@ from spike4dgs.benchmark.schemas import check_schema, load_schema
 Record = dict[str, Any]  # a cell of record.schema.json
 Key = tuple[str, str, int, float | str, str]
 FORMAT = "spike4dgs-cells/1"
-METRICS = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip", "lpips_alex", "lpips_vgg", "temporal_error")
+METRICS = (
+    "psnr",
+    "ssim",
+    "psnr_dynamic",
+    "ssim_dynamic",
+    "psnr_covisible",
+    "flip",
+    "lpips_alex",
+    "lpips_vgg",
+    "temporal_error",
+)
 COSTS = ("fit_seconds", "render_fps", "peak_memory_mb")
 DIGITS = 12  # of hashes in records
 FAILED = "failed"  # the beginning of an error; the other is "skipped", such as for weights that are not there

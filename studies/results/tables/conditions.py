@@ -18,7 +18,7 @@ from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.worlds import HARD
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance, psnr_texts
-from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
+from spike4dgs.studies.results.comparison import BOTH, MeasuredRow, rows_of
 from spike4dgs.studies.results.plan import NOT_TUNED, OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
@@ -154,8 +154,8 @@ def _seeds(names: Sequence[str], own: Sequence[Record]) -> list[str]:
     sentences, own = [], of_group(GROUP, own)
     for name in names:
         rows = [row for scene in GROUP.scenes for row in rows_of([name], (scene,), own) if len(row.seeds) > 1]
-        values = [(row.values("psnr"), row.values(RANKED_BY)) for row in rows]
-        variances = [[np.var(v[0], ddof=1) for v in (a, b)] for a, b in values if a and b]
+        found = [[row.variance(metric) for metric in BOTH] for row in rows]
+        variances = [[v for v in pair if v is not None] for pair in found if None not in pair]
         if variances:
             deviations = " / ".join(f"{d:.2f}" for d in np.sqrt(np.mean(variances, axis=0)))
             seeds = max(len(row.seeds) for row in rows)

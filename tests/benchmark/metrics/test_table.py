@@ -81,7 +81,7 @@ def test_predictions_without_a_positive_gain_have_no_aligned_values(value: float
     assert gain is None
     metrics, notes = summary({"cam/000001": measure(truth, prediction, EVERYWHERE, gain, "x")})
     for m in CHOSEN.metrics:
-        assert (metrics[m.id] is None) == (m.aligned or m.images is Images.LATER)
+        assert (metrics[m.id] is None) == (m.aligned or m.images in (Images.LATER, Images.COVISIBLE))
         assert (notes.get(m.id) == "no positive gain fits the predictions") == m.aligned
 
 
@@ -148,11 +148,11 @@ def test_the_table_describes_every_metric_once() -> None:
     shown = ["lpips_alex", "lpips_vgg", "lpips_squeeze", "flip", "brisque", "niqe", "metaiqa"]
     windows = [f"spike_psnr_{ticks}" for ticks in (5, 20, 80)]
     spikes = [f"{metric}{region}" for region in ("", "_dynamic") for metric in (*windows, "spike_deviance")]
-    assert list(METRICS) == [*linear, *shown, "temporal_error", *spikes]
+    assert list(METRICS) == [*linear, "psnr_covisible", *shown, "temporal_error", *spikes]
     assert [m.id for m in METRICS.values() if m.takes == "spikes"] == spikes
     assert [m.id for m in METRICS.values() if m.takes == "srgb8"] == shown
     better = {m.id for m in METRICS.values() if m.higher_is_better}
-    assert better == {*linear, "metaiqa", *(m for m in spikes if "psnr" in m)}
+    assert better == {*linear, "psnr_covisible", "metaiqa", *(m for m in spikes if "psnr" in m)}
     assert PRIMARY in METRICS
     for m in METRICS.values():
         assert m.title and m.definition and m.implementation and m.digits > 0 < m.tolerance
@@ -162,9 +162,8 @@ def test_the_table_describes_every_metric_once() -> None:
 def test_one_image_is_scored_by_every_metric_that_has_a_value() -> None:
     truth, prediction = images()
     values = score_image(truth, prediction, region(), metrics=("psnr", "flip"))
-    assert set(values) == {m.id for m in METRICS.values() if m.takes == "linear" and m.images is not Images.LATER} | {
-        "flip"
-    }
+    without = {Images.LATER, Images.COVISIBLE}
+    assert set(values) == {m.id for m in METRICS.values() if m.takes == "linear" and m.images not in without} | {"flip"}
     gain = fit_gain([(truth, prediction)])
     expected = measure(truth, prediction, region(), gain)
     assert {k: values[k] for k in expected if k in values} == {k: v for k, v in expected.items() if k in values} | {

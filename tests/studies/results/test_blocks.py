@@ -34,6 +34,7 @@ from spike4dgs.studies.results.tables.conditions import (
     content_block,
 )
 from spike4dgs.studies.results.tables.conditions import GROUP as ON_CONDITIONS
+from spike4dgs.studies.results.tables.covisible import covisible_block
 from spike4dgs.studies.results.tables.images import TABLE6, images_block
 from spike4dgs.studies.results.tables.modality import GROUP as ON_SENSORS
 from spike4dgs.studies.results.tables.modality import NOISY, modality_block, noisy_block, plot_modality
@@ -55,6 +56,7 @@ SHOWN = {  # a block -> two rows that it has, if not those of the tables
     "modality-noisy": ("edi+stg", "rgb+stg"),
     "pairs": ("tfp+stg", "tfp+4dgs"),
     "cameras": ("spike4dgs-x", "tfp+stg"),
+    "covisible": ("spike4dgs-x", "tfp+stg"),
     "own-scenes": ("spike4dgs-x",),
     "realistic": ("spike4dgs-x", "tfp+stg"),
     "parts": ("spike4dgs-x",),
@@ -66,6 +68,7 @@ GROUP = Group("made", "Made", SCENES, (Row(OURS, 2, "here", True), Row("a"), Row
 
 def record(row: str, scene: str, moving: float, seed: int = 0, **changes: Any) -> dict[str, Any]:
     metrics = {"psnr": moving + 2, "ssim": 0.97, "psnr_dynamic": moving, "ssim_dynamic": 0.96, "flip": 0.05}
+    metrics["psnr_covisible"] = moving + 3
     return {
         "row": row,
         "scene": scene,
@@ -226,6 +229,7 @@ def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name
         "cameras": replace(TRACK_SMALL, scenes=(*TRACK_SMALL.scenes, *NINE.scenes)),
         "conditions": ON_CONDITIONS,
         "content": CONTENT,
+        "covisible": TRACK_SMALL,
         "modality": ON_SENSORS,
         "modality-noisy": NOISY,
         "parts": PARTS,
@@ -372,6 +376,28 @@ def test_a_condition_with_refined_held_out_poses_has_the_scores_of_the_refined_r
     found += [record(f"{OURS}.refined", s, 29.75) for s in poses.scenes]
     lines = conditions_block(found)
     assert [line.split(" | ")[2] for line in lines[3:5]] == ["-1.50 / -1.50", "-0.25 / -0.25"]
+
+
+def test_what_few_cameras_see_is_told_by_its_difference_and_between_seeds():
+    """Seeds move the whole image by 2 dB on every other scene, co-visible pixels nowhere: deviations of 1 and 0."""
+
+    def cell(row: str, scene: str, value: float, covisible: float | None, seed: int = 0) -> dict[str, Any]:
+        known = {} if covisible is None else {"psnr_covisible": covisible}
+        return record(row, scene, value, seed) | {"metrics": {"psnr": value, "psnr_dynamic": value, **known}}
+
+    scenes = TRACK_SMALL.scenes[:2]
+    found = [cell(OURS, s, 30 + 2 * k * seed, 33, seed) for k, s in enumerate(scenes) for seed in (0, 1)]
+    found += [cell("tfp+stg", s, 25, 25.5) for s in scenes] + [cell("spike4dgs", scenes[0], 25, 25.5)]
+    found += [cell("spk2img+stg", s, 25, None) for s in scenes]
+    none, lens, blur = CONDITIONS[:3]
+    found += [cell(OURS, s, value, 40) for c, value in ((none, 40), (lens, 39)) for s in c.scenes]
+    found += [cell(OURS, s, 38, None) for s in blur.scenes]
+    assert covisible_block(found)[2:6] == [
+        f"| `{OURS}`, 2 scenes | 30.50 | 33.00 | 1.00 | 0.00 |",
+        "| `tfp+stg`, 2 scenes | 25.00 | 25.50 | - | - |",
+        f"| `{OURS}`, lens, known | -1.00 | +0.00 |  |  |",
+        "",
+    ]
 
 
 def test_hard_content_has_a_column_for_each_world():
