@@ -2,6 +2,7 @@
 
 images STRIP OUT: of strip_SCENE.png of `speed images`. sensor SCENE OUT. conditions, modality and uncalibrated OUT: of
 the records. sheets SWEEP SCENES FOLDER, hard SWEEP SCENES OUT: of the predictions of `report results` on the scenes.
+covisible SCENE SCENE OUT: of a scene with all its cameras and of one with three.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from spike4dgs.benchmark import open_scene
 from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.metrics.covisible import covisible as find_covisible
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.measure import measure
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -181,6 +184,20 @@ def hard(sweep: Path, scenes: Path, out: Path) -> None:
     _save(figure, out, SHEET_WIDTH)
 
 
+def covisible(every: Path, three: Path, out: Path) -> None:
+    """Mark the pixels that `psnr_covisible` leaves out, in a scene with all cameras and in one with three."""
+    figure = new_figure((8, 2.8), "constrained")
+    for axis, (folder, split) in zip(figure.subplots(1, 2), ((every, DEFAULT_SPLIT), (three, "views-3")), strict=True):
+        scene = open_scene(folder, split=split)
+        target = scene.targets[len(scene.targets) // 2]
+        shown = np.repeat(encode_srgb(scene.ground_truth(target))[..., None], 3, axis=-1)
+        shown[~(find_covisible(scene)[target.camera] | scene.moving(target))] = 220, 40, 30
+        axis.set_axis_off()
+        axis.set_title(f"{scene.id.partition('-small')[0]}, {len(scene.train)} training cameras", fontsize=8)
+        axis.imshow(shown, interpolation="nearest")
+    _save(figure, out, SHEET_WIDTH)
+
+
 def _moving(group: Group) -> dict[str, float]:
     own = of_group(group, list(read_records(RECORDS).values()))
     rows = rows_of([row.name for row in group.rows], group.scenes, own)
@@ -231,6 +248,7 @@ def _as_webp(png: Path, out: Path, width: int | None = None) -> None:
 
 FIGURES = {
     "conditions": conditions,
+    "covisible": covisible,
     "hard": hard,
     "images": images,
     "modality": modality,
