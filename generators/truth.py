@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.images import gray, read_exr, read_mask, write_exr, write_geometry, write_mask
 from spike4dgs.benchmark.scene.scene import Scene, Target
 from spike4dgs.generators.profiles import RATE_HZ, TARGET_EVERY, Job
@@ -242,7 +243,7 @@ def second_renderings(scene: Scene) -> tuple[Target, NDArray[np.float32], NDArra
     """Return the middle target of the simulated held-out camera and two renderings of it, linear radiance [H, W].
 
     Each has the noise of ground truth. None for a scene that no world of this installation made, and
-    for a split whose held-out cameras have no target of that camera.
+    for a split whose held-out cameras have no target of that camera. Raises UserError where one is not finite.
     """
     job = recorded_job(scene.meta["source"])
     if job is None:
@@ -254,7 +255,11 @@ def second_renderings(scene: Scene) -> tuple[Target, NDArray[np.float32], NDArra
     print(f"rendering a target of {scene.id} twice more, to know its noise: about half a minute", file=sys.stderr)
     for seed in _SECOND_SEEDS:
         rendered = second_truth(job, held_out_view(job), job.seed + seed)
-        images.append(rendered(target.tick / RATE_HZ) * np.float32(job.light_at(target.tick)))
+        image = rendered(target.tick / RATE_HZ) * np.float32(job.light_at(target.tick))
+        if not np.isfinite(image).all():  # as happened once, and not when the same was rendered again
+            found = f"{np.count_nonzero(~np.isfinite(image))} pixels that are not"
+            raise problem(f"{scene.id}, {target.name}", "a finite second rendering", found, "submit again")
+        images.append(image)
     return target, images[0], images[1]
 
 

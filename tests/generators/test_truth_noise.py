@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.generators import truth as renderings
 from spike4dgs.generators.profiles import RATE_HZ, SPLIT_PROFILES, Job
 from spike4dgs.generators.render_tasks import RenderTargets, cameras_of, renderer_of
 from spike4dgs.generators.truth import second_renderings, second_truth
@@ -31,6 +33,17 @@ def test_second_renderings_show_the_truths_noise(tiny_data: Path) -> None:
     assert between < ceiling, "each of them has noise of its own"
     share, error = noise_share(truth, truth, first, second)
     assert share == pytest.approx(1, abs=0.02) and error is not None and error < 0.02
+
+
+def test_a_second_rendering_with_a_pixel_that_is_no_number_is_refused(
+    tiny_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = open_scene(tiny_data / "car-0-tiny")
+    image = scene.ground_truth(scene.targets[0])
+    image[3, 5] = np.nan
+    monkeypatch.setattr(renderings, "second_truth", lambda *_: lambda _: image)
+    with pytest.raises(UserError, match=r"car-0-tiny.*finite second rendering, found 1 pixels that are not"):
+        second_renderings(scene)
 
 
 @pytest.mark.slow
