@@ -35,11 +35,11 @@ def covisible(scene: Scene) -> dict[str, Mask]:
     cameras = (*scene.train, *scene.test)
     found = [match.groups() for match in map(_DEPTH.fullmatch, scene.manifest.files) if match]
     ticks = set.intersection(*({tick for name, tick in found if name == camera} for camera in cameras))
-    try:
-        depth = {camera: _resting_depth(scene, camera, sorted(ticks)) for camera in cameras if ticks}
-    except UserError:  # no other metric needs them
+    if not ticks:
         return {}
-    if not depth:
+    try:
+        depth = {camera: _resting_depth(scene, camera, sorted(ticks)) for camera in cameras}
+    except UserError:  # no other metric needs them
         return {}
     seen_by = {scene.cameras[camera]: depth[camera] for camera in scene.train}
     return {camera: count_views(scene.cameras[camera], depth[camera], seen_by) >= CAMERAS for camera in scene.test}

@@ -20,6 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Mask
 from spike4dgs.benchmark.metrics.covisible import CAMERAS
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.lpips import TRUNKS, lpips
@@ -39,15 +40,15 @@ def _psnr(pair: ImagePair) -> float:
 
 
 def _psnr_dynamic(pair: ImagePair) -> float | None:
-    if not pair.moving.any():
-        return None
-    return psnr_db((pair.truth[pair.moving] - pair.prediction[pair.moving]) ** 2)
+    return _psnr_in(pair, pair.moving)
 
 
 def _psnr_covisible(pair: ImagePair) -> float | None:
-    if pair.covisible is None or not (region := pair.covisible | pair.moving).any():
-        return None
-    return psnr_db((pair.truth[region] - pair.prediction[region]) ** 2)
+    return None if pair.covisible is None else _psnr_in(pair, pair.covisible | pair.moving)
+
+
+def _psnr_in(pair: ImagePair, region: Mask) -> float | None:
+    return psnr_db((pair.truth[region] - pair.prediction[region]) ** 2) if region.any() else None
 
 
 def _ssim_dynamic(pair: ImagePair) -> float | None:

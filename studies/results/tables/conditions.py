@@ -109,7 +109,7 @@ VIEWS = tuple(
     for condition in CONDITIONS
     if condition.split != DEFAULT_SPLIT
 )
-_EVERY = (GROUP, REFINED, *VIEWS)
+EVERY = (GROUP, REFINED, *VIEWS)
 CONTENT = Group("content", "Hard content", tuple(f"{world}-1-small" for world in HARD), GROUP.rows)
 CEILINGS = Group("ceilings", "Noise of the truth", (*GROUP.scenes, *CONTENT.scenes), (Row(CEILING, 1, NOT_TUNED),))
 _NOISE = "noise of the truth"
@@ -137,12 +137,12 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         f"others its change; a prediction without error has the PSNR of the {_NOISE}."
     )
-    return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *_EVERY)]
+    return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *EVERY)]
 
 
 def of_conditions(records: Sequence[Record]) -> list[Record]:
     """Return the records of all conditions."""
-    return [record for group in _EVERY for record in of_group(group, records)]
+    return [record for group in EVERY for record in of_group(group, records)]
 
 
 def _ceiling(condition: Condition, records: Sequence[Record]) -> str:

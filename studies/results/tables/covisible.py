@@ -27,7 +27,8 @@ def covisible_block(records: Sequence[Record]) -> list[str]:
         f"has the change of the means of {' and '.join(conditions.WORLDS)}."
     )
     shown = [record for record in (*own, *under) if METRICS[1] in record["metrics"]]
-    return [*markdown(heads, [*track, *changes]), "", legend, "", provenance(shown, realistic.GROUP, conditions.GROUP)]
+    groups = realistic.GROUP, *conditions.EVERY
+    return [*markdown(heads, [*track, *changes]), "", legend, "", provenance(shown, *groups)]
 
 
 def _track_lines(own: Sequence[Record]) -> list[list[str]]:
