@@ -13,7 +13,9 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.compilation import cached_njit
+from spike4dgs.method.motion.hexplane_ir import add_gradients, look_up
 from spike4dgs.method.two_threads import on_two_threads
 
 
@@ -30,78 +32,40 @@ def _cell(u: np.float32, size: int) -> tuple[int, np.float32, np.float32]:
     return i, x - np.float32(i), slope
 
 
-@cached_njit(nogil=True, fastmath=True, error_model="numpy")
-def _forward(unit, space, lines, out):  # [N, 3], [3, R, R, F], [3, R, F], [N, F]
-    size, features = lines.shape[1], lines.shape[2]
-    for n in range(len(unit)):
-        i, wi, _ = _cell(unit[n, 0], size)
-        j, wj, _ = _cell(unit[n, 1], size)
-        k, wk, _ = _cell(unit[n, 2], size)
-        vi, vj, vk = np.float32(1) - wi, np.float32(1) - wj, np.float32(1) - wk
-        p, q = space[0, i, j : j + 2], space[0, i + 1, j : j + 2]
-        r, s = space[1, i, k : k + 2], space[1, i + 1, k : k + 2]
-        t, u = space[2, j, k : k + 2], space[2, j + 1, k : k + 2]
-        x, y, z = lines[0, i : i + 2], lines[1, j : j + 2], lines[2, k : k + 2]
-        for f in range(features):
-            xy = vi * (vj * p[0, f] + wj * p[1, f]) + wi * (vj * q[0, f] + wj * q[1, f])
-            xz = vi * (vk * r[0, f] + wk * r[1, f]) + wi * (vk * s[0, f] + wk * s[1, f])
-            yz = vj * (vk * t[0, f] + wk * t[1, f]) + wj * (vk * u[0, f] + wk * u[1, f])
-            line = (vi * x[0, f] + wi * x[1, f]) * (vj * y[0, f] + wj * y[1, f]) * (vk * z[0, f] + wk * z[1, f])
-            out[n, f] = xy * xz * yz * line
+@njit(inline="always")
+def _place(unit: Any, n: int, size: int) -> Any:
+    """Return ((i, j, k), (wi, wj, wk)) of a point, and its cells per unit along each axis."""
+    i, wi, si = _cell(unit[n, 0], size)
+    j, wj, sj = _cell(unit[n, 1], size)
+    k, wk, sk = _cell(unit[n, 2], size)
+    return ((i, j, k), (wi, wj, wk)), (si, sj, sk)
 
 
-@cached_njit(nogil=True, fastmath=True, error_model="numpy")
-def _backward(unit, space, lines, grad, grad_unit, grad_space, grad_lines):
+@cached_njit(nogil=True, error_model="numpy")
+def _forward(unit: Float32, space: Float32, lines: Float32, out: Float32) -> None:
+    """Set features [N, F] of points [N, 3]: planes [3, R, R, F], lines [3, R, F]."""
     size, features = lines.shape[1], lines.shape[2]
-    one = np.float32(1)
     for n in range(len(unit)):
-        i, wi, si = _cell(unit[n, 0], size)
-        j, wj, sj = _cell(unit[n, 1], size)
-        k, wk, sk = _cell(unit[n, 2], size)
-        vi, vj, vk = one - wi, one - wj, one - wk
-        p, q = space[0, i, j : j + 2], space[0, i + 1, j : j + 2]
-        r, s = space[1, i, k : k + 2], space[1, i + 1, k : k + 2]
-        t, u = space[2, j, k : k + 2], space[2, j + 1, k : k + 2]
-        x, y, z = lines[0, i : i + 2], lines[1, j : j + 2], lines[2, k : k + 2]
-        dp, dq = grad_space[0, i, j : j + 2], grad_space[0, i + 1, j : j + 2]
-        dr, ds = grad_space[1, i, k : k + 2], grad_space[1, i + 1, k : k + 2]
-        dt, du = grad_space[2, j, k : k + 2], grad_space[2, j + 1, k : k + 2]
-        dx, dy, dz = grad_lines[0, i : i + 2], grad_lines[1, j : j + 2], grad_lines[2, k : k + 2]
-        gi = gj = gk = np.float32(0)
-        for f in range(features):
-            p0, p1 = vj * p[0, f] + wj * p[1, f], vj * q[0, f] + wj * q[1, f]
-            r0, r1 = vk * r[0, f] + wk * r[1, f], vk * s[0, f] + wk * s[1, f]
-            t0, t1 = vk * t[0, f] + wk * t[1, f], vk * u[0, f] + wk * u[1, f]
-            xy, xz, yz = vi * p0 + wi * p1, vi * r0 + wi * r1, vj * t0 + wj * t1
-            lx, ly, lz = vi * x[0, f] + wi * x[1, f], vj * y[0, f] + wj * y[1, f], vk * z[0, f] + wk * z[1, f]
-            g = grad[n, f]
-            planes, line = xy * xz * yz, lx * ly * lz
-            gxy, gxz, gyz = g * line * xz * yz, g * line * xy * yz, g * line * xy * xz
-            gx, gy, gz = g * planes * ly * lz, g * planes * lx * lz, g * planes * lx * ly
-            dp[0, f] += gxy * vi * vj
-            dp[1, f] += gxy * vi * wj
-            dq[0, f] += gxy * wi * vj
-            dq[1, f] += gxy * wi * wj
-            dr[0, f] += gxz * vi * vk
-            dr[1, f] += gxz * vi * wk
-            ds[0, f] += gxz * wi * vk
-            ds[1, f] += gxz * wi * wk
-            dt[0, f] += gyz * vj * vk
-            dt[1, f] += gyz * vj * wk
-            du[0, f] += gyz * wj * vk
-            du[1, f] += gyz * wj * wk
-            dx[0, f] += gx * vi
-            dx[1, f] += gx * wi
-            dy[0, f] += gy * vj
-            dy[1, f] += gy * wj
-            dz[0, f] += gz * vk
-            dz[1, f] += gz * wk
-            gi += gxy * (p1 - p0) + gxz * (r1 - r0) + gx * (x[1, f] - x[0, f])
-            gj += gyz * (t1 - t0) + gy * (y[1, f] - y[0, f])
-            gj += gxy * (vi * (p[1, f] - p[0, f]) + wi * (q[1, f] - q[0, f]))
-            gk += gxz * (vi * (r[1, f] - r[0, f]) + wi * (s[1, f] - s[0, f])) + gz * (z[1, f] - z[0, f])
-            gk += gyz * (vj * (t[1, f] - t[0, f]) + wj * (u[1, f] - u[0, f]))
-        grad_unit[n, 0], grad_unit[n, 1], grad_unit[n, 2] = gi * si, gj * sj, gk * sk
+        look_up(space, lines, size, features, _place(unit, n, size)[0], out, n)
+
+
+@cached_njit(nogil=True, error_model="numpy")
+def _backward(
+    unit: Float32,
+    space: Float32,
+    lines: Float32,
+    grad: Float32,
+    grad_unit: Float32,
+    grad_space: Float32,
+    grad_lines: Float32,
+) -> None:
+    """Set the gradients of the points, and add those of planes and lines."""
+    size, features = lines.shape[1], lines.shape[2]
+    for n in range(len(unit)):
+        at, slopes = _place(unit, n, size)
+        own = add_gradients(space, lines, size, features, at, grad, n, grad_space, grad_lines)
+        for axis in range(3):
+            grad_unit[n, axis] = own[axis] * slopes[axis]
 
 
 def _each_level(jobs: list[tuple[Any, ...]]) -> None:

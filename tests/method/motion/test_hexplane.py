@@ -167,6 +167,12 @@ def test_time_smoothness_ignores_steady_change_and_measures_acceleration():
     assert time_smoothness([accelerated]).item() == pytest.approx(3 * 4)
 
 
+def test_gradients_of_differences_are_those_of_finite_differences():
+    planes = [torch.randn(3, r, r, 2, generator=rng(r), dtype=torch.float64, requires_grad=True) for r in (5, 4)]
+    for penalty in (plane_tv, time_smoothness):
+        assert torch.autograd.gradcheck(lambda *found, f=penalty: f(found), planes)
+
+
 def test_time_sparsity_is_the_distance_from_one():
     assert time_sparsity([torch.ones(3, 4, 5, 2)]).item() == 0
     assert time_sparsity([torch.full((3, 4, 5, 2), 0.25)]).item() == pytest.approx(3 * 0.75)
