@@ -19,8 +19,6 @@ to the last bit. In the kernels `lost`, `words` and `before` are those of `Spike
 
 from __future__ import annotations
 
-import numpy as np
-
 from spike4dgs.benchmark.arrays import Int64, UInt32, UInt64
 from spike4dgs.benchmark.spikes.bits import kernel
 from spike4dgs.benchmark.spikes.trains import count_before
@@ -39,12 +37,6 @@ def doubtful_between(lost: Int64, words: UInt64, before: UInt32, pixel: int, fir
         count_before(words[0], before[0], pixel, b) - count_before(words[0], before[0], pixel, a),
         count_before(words[1], before[1], pixel, b) - count_before(words[1], before[1], pixel, a),
     )
-
-
-@kernel
-def is_doubtful(words: UInt64, pixel: int, number: int) -> bool:
-    """Return whether the lost tick of a number is in doubt for a pixel."""
-    return bool(words[0, number >> 6, pixel] >> np.uint64(number & 63) & np.uint64(1))
 
 
 @kernel

@@ -70,7 +70,8 @@ class ImageMaker(Shown):
     settings: Settings = Settings()  # the maker's own numbers (prefix `image_maker`)
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
-    rate_over: Callable[..., tuple[Float32, Float32]] | None = None  # rate, and its spans [2, H, W]
+    # Rate, the spans [2, H, W] that it is a mean over, and their doubts, see `with_spans`; None: rates are of instants.
+    rate_over: Callable[..., tuple[Float32, Float32, Float32 | None]] | None = None
     knows_light: bool = False  # `rate` and `rate_over` take `light`, see `images.light`; else they take it as steady
     made_on: Callable[[str], ImageMaker] | None = None  # the maker on a device; None: there is no choice of device
     label: str | None = None  # in descriptions of recipes, after "images"; None: the name
@@ -115,18 +116,27 @@ class ImageMaker(Shown):
 
     def with_spans(
         self, stream: SpikeStream, ticks: Sequence[int], gain: float, camera: Calibration | None = None
-    ) -> tuple[Float32, Float32 | None]:
+    ) -> tuple[Float32, Float32 | None, Float32 | None]:
         """Return the images, and the span that each value is a mean over: [n, 2, H, W] in ticks from each of `ticks`.
 
-        None: the images show instants.
+        None: the images show instants. Last come doubts [n, 4, H, W], None where no tick is lost: a span's spikes in
+        doubt at most, the radiance of one, that of the span without any, and how much more the image has.
         """
         if self.rate_over is None:
-            return self(stream, ticks, gain, camera), None
+            return self(stream, ticks, gain, camera), None, None
         for tick in ticks:
             _require_tick(stream, tick)
         found = [self.rate_over(stream, tick, self.settings) for tick in ticks]
-        rates = gathered(np.stack([rate for rate, _ in found]), stream.dead_ticks)
-        return self._radiance(rates, gain, camera), np.stack([s for _, s in found])
+
+        def radiance(rates: Float32) -> Float32:
+            return self._radiance(gathered(rates, stream.dead_ticks), gain, camera)
+
+        images, doubts = radiance(np.stack([rate for rate, _, _ in found])), None
+        if found[0][2] is not None:
+            most, one, without = np.stack([doubt for _, _, doubt in found], 1)
+            low, high = radiance(without.copy()), radiance(without + one)
+            doubts = np.stack([most, high - low, low, images - low], 1)
+        return images, np.stack([spans for _, spans, _ in found]), doubts
 
     def _radiance(self, images: Float32, gain: float, camera: Calibration | None) -> Float32:
         """Return radiance from rates [n, H, W], which may be overwritten."""

@@ -14,11 +14,11 @@ light changes, the shorter its span.
 A window that no change ends soon may still hide one of less than a spike: a faint texture that moves. So `adaptive`'s
 rate over the whole window is taken only where light is constant for much longer than a span.
 
-Of a recording that lacks ticks, j - i is certain only within one run, which holds no lost tick that is in doubt for the
-pixel. A span that would hold such ticks is moved into a run: of those near by, the one that holds the longest part of a
-window of 2 h moved by no more than MOVED h. Where that span is less than LEAST of the other, as in the dark, the other
-is kept, with the rate k / (T - D) of `lost_spikes`: spikes in doubt would lie to the same side wherever light changes
-in the same way.
+Of a recording that lacks ticks, j - i may be in doubt: a span that holds D lost ticks in doubt for the pixel (see
+`lost_spikes`) gathered anything from its k certain thresholds to k + D. Its rate is k / (T - D), what was recorded over
+the time of the recording; the likeliest number errs less, but to the same side wherever light changes in the same way.
+The span says what it may have gathered, and a fit's own model tells later how much it was (`training_views.instants`):
+a spike is a tenth or more of a span, and a model that is halfway fitted is wrong by less.
 """
 
 from __future__ import annotations
@@ -31,16 +31,12 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float32, Float64, Int64, UInt32, UInt64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import in_threads, kernel
-from spike4dgs.benchmark.spikes.lost_spikes import doubtful_between, is_doubtful
+from spike4dgs.benchmark.spikes.lost_spikes import doubtful_between
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import count_before, first_from, last_before, spike_trains
 from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows, rates, shared_levels
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.light import PixelLight, steady
-
-MOVED = 0.5  # of h, at most, that a window's middle moves to lie between lost ticks
-FOLLOWED = 2.0  # times h from the tick, at most, that a moved span ends: beyond it a fit follows no span
-LEAST = 0.5  # of the span with lost ticks, that a moved one is long: half as long is half as precise
 
 
 @dataclass(frozen=True)
@@ -77,11 +73,12 @@ def interval_image(
 
 def intervals(
     stream: SpikeStream, tick: int, settings: IntervalSettings | None = None, light: PixelLight | None = None
-) -> tuple[Float32, Float32]:
-    """Return spikes per tick [H, W] and the spans [2, H, W] that they are means over; see the module.
+) -> tuple[Float32, Float32, Float32 | None]:
+    """Return spikes per tick [H, W], the spans [2, H, W] that they are means over, and their doubts; see the module.
 
     They are those of mean light; where `light` has shares, of the light that there is. None: light is steady. With
-    shares a pixel whose window is long has the rate of `tick` itself, and an empty span.
+    shares a pixel whose window is long has the rate of `tick` itself, and an empty span. Doubts [3, H, W] are a span's
+    spikes in doubt at most, the rate of one, and the rate without any; None where no tick is lost.
     """
     s = settings or IntervalSettings()
     trains, pixels, apart = spike_trains(stream), stream.height * stream.width, bool(light and len(light.shares))
@@ -90,11 +87,12 @@ def intervals(
     rate, halves = rates(stream, tick, s, levels, light), half_spans(stream.n_ticks, s)[levels]
     spans = np.empty((2, pixels), np.float32)
     spans[0], spans[1] = (0, 0) if apart else (-s.half, s.half)
-    in_threads(
-        _measure, pixels, *trains.arrays, np.flatnonzero(np.diff(trains.lost)), tick, halves, changing, rate, spans
-    )
-    image, ends = rate.reshape(stream.height, stream.width), spans.reshape(2, stream.height, stream.width)
-    return (image[::-1], ends[:, ::-1]) if stream.rows_bottom_up else (image, ends)
+    doubts = np.zeros((3, pixels if stream.filled else 0), np.float32)
+    in_threads(_measure, pixels, *trains.arrays, tick, halves, changing, rate, spans, doubts)
+    image, ends, doubtful = (a.reshape(-1, stream.height, stream.width) for a in (rate, spans, doubts))
+    if stream.rows_bottom_up:
+        image, ends, doubtful = image[:, ::-1], ends[:, ::-1], doubtful[:, ::-1]
+    return image[0], ends, doubtful if stream.filled else None
 
 
 @kernel
@@ -113,66 +111,22 @@ def _nearest(words: UInt64, before: UInt32, pixel: int, total: int, instant: flo
 
 
 @kernel
-def _between_doubts(
-    words: UInt64,
-    before: UInt32,
-    doubt_words: UInt64,
-    lost_ticks: Int64,
-    pixel: int,
-    total: int,
-    tick: int,
-    half: float,
-    n_ticks: int,
-) -> tuple[int, int, int, int]:
-    """Return number and tick of the first and the last spike of a span within one run; twice the same: there is none.
-
-    `half` is in ticks, `total` the pixel's certain spikes. Runs lie between lost ticks that are in doubt.
-    """
-    longest, found, reach = 0.0, (0, 0, 0, 0), (1 + MOVED) * half
-    k, start = int(np.searchsorted(lost_ticks, int(np.ceil(tick - reach)))), 0
-    for earlier in range(k - 1, -1, -1):
-        if is_doubtful(doubt_words, pixel, earlier):
-            start = lost_ticks[earlier] + 1
-            break
-    while start < min(tick + reach, n_ticks):
-        while k < len(lost_ticks) and not is_doubtful(doubt_words, pixel, k):
-            k += 1
-        stop = lost_ticks[k] if k < len(lost_ticks) else n_ticks
-        low, high = max(float(start), tick - reach), min(float(stop), tick + reach)
-        if high - low > 2 * half:
-            middle = min(max(float(tick), low + half), high - half)
-            low, high = middle - half, middle + half
-        begin, end = count_before(words, before, pixel, start), count_before(words, before, pixel, stop)
-        if high - low > longest and end - begin >= 2:
-            i, first = _nearest(words, before, pixel, total, low, n_ticks)
-            j, last = _nearest(words, before, pixel, total, high, n_ticks)
-            if i < begin:
-                i, first = begin, first_from(words, pixel, start)
-            if j >= end:
-                j, last = end - 1, last_before(words, pixel, stop)
-            if i < j and tick - first - 0.5 <= FOLLOWED * half and last + 0.5 - tick <= FOLLOWED * half:
-                longest, found = high - low, (i, first, j, last)
-        k, start = k + 1, stop + 1
-    return found
-
-
-@kernel
 def _measure(
     words: UInt64,
     before: UInt32,
     lost: Int64,
     doubt_words: UInt64,
     doubt_before: UInt32,
-    lost_ticks: Int64,
     tick: int,
     halves: Float32,
     light: Float64,
     rate: Float32,
     spans: Float32,
+    doubts: Float32,
     start: int,
     stop: int,
 ) -> None:
-    """Set rate and span of the pixels that change, from the spikes nearest to either end."""
+    """Set rate, span and doubts of the pixels that change, from the spikes nearest to either end."""
     n = len(light)
     for p in range(start, stop):
         if halves[p] == np.inf:
@@ -187,16 +141,12 @@ def _measure(
                 i, first = i - 1, last_before(words, p, first)
             else:
                 j, last = j + 1, first_from(words, p, last + 1)
-        length = light[last] - light[first]
-        doubt = 0
+        length, doubt = light[last] - light[first], 0
         if lost[last] > lost[first]:
             doubt, _ = doubtful_between(lost, doubt_words, doubt_before, p, first, last)
         if doubt > 0:
-            a, begin, b, end = _between_doubts(words, before, doubt_words, lost_ticks, p, total, tick, halves[p], n)
-            if end > begin and end - begin >= LEAST * (last - first):
-                i, first, j, last, length = a, begin, b, end, light[end] - light[begin]
-            else:
-                length *= 1 - doubt / (last - first)
+            doubts[0, p], doubts[1, p], doubts[2, p] = doubt, np.float32(1 / length), np.float32((j - i) / length)
+            length *= 1 - doubt / (last - first)
         rate[p] = np.float32((j - i) / length)
         spans[0, p], spans[1, p] = first + 0.5 - tick, last + 0.5 - tick
 

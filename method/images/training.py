@@ -65,12 +65,11 @@ def make_training_images(
     `light` is what changes in the scene's light, if anything: makers that know of it show mean light. Where it is a
     lamp's they show the light that there is, and the images say so.
     """
-    ticks, made, measured = _make(scene, make, settings, device, light)
+    ticks, made, spans = _make(scene, make, settings, device, light)
     images = torch.from_numpy(made).to(device)
     bad, missing = bad_pixels(scene), missing_images(scene, ticks)
     masks = None if bad is None else torch.from_numpy(np.stack(bad)).to(device)
     lacking = None if missing is None else torch.from_numpy(missing).to(device)
-    spans = None if measured is None else _spans(scene, measured, device)
     views, lamp = Views.from_cameras(cameras, device=device), light.factors if light and light.local else None
     return TrainingImages(views, ticks, images, scene.n_ticks, masks, lacking, spans, light=lamp)
 
@@ -96,25 +95,27 @@ def make_images(
 
 def _make(
     scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str, light: Light | None = None
-) -> tuple[tuple[int, ...], Float32, list[Half] | None]:
-    """Return ticks and images as `make_images` does, and each camera's spans [T, 2, H, W] if images are means."""
+) -> tuple[tuple[int, ...], Float32, Spans | None]:
+    """Return ticks and images as `make_images` does, and the spans of time that they are means over, if they are."""
     make = make.on(device)
     ticks = choose_ticks(scene.n_ticks, settings)
     height, width = scene.streams[0].height, scene.streams[0].width
     images = np.empty((len(ticks), len(scene.cameras), height, width), np.float32)
     spans: list[Half] = []
+    doubts: list[Half | None] = []
     for c, (camera, stream) in enumerate(zip(scene.cameras, scene.streams, strict=True)):
         state = scene.state(camera.id)
         own, _ = local_ticks(state.clock, ticks, scene.n_ticks)
         calibration = scene.calibrations[c] if settings.flat_field and scene.calibrations else None
         gain = scene.radiance_gain * (1.0 if calibration else state.gain)
         lit = make.in_light(_own_light(light, stream, state.clock)) if light else make
-        images[:, c], over = lit.with_spans(stream, own, gain, calibration)
+        images[:, c], over, doubtful = lit.with_spans(stream, own, gain, calibration)
         if over is not None:
             spans.append(over.astype(np.float16))
+            doubts.append(None if doubtful is None else doubtful.astype(np.float16))
         spike_trains.cache_clear()  # else two streams' trains would be in memory
         stream.release()
-    return ticks, images, spans or None
+    return ticks, images, _spans(scene, spans, doubts, device) if spans else None
 
 
 def _own_light(light: Light, stream: SpikeStream, clock: Clock) -> PixelLight:
@@ -123,12 +124,16 @@ def _own_light(light: Light, stream: SpikeStream, clock: Clock) -> PixelLight:
     return shared(stream, gathered) if light.local else PixelLight(gathered)
 
 
-def _spans(scene: TrainingScene, measured: list[Half], device: str) -> Spans:
+def _spans(scene: TrainingScene, measured: list[Half], doubts: list[Half | None], device: str) -> Spans:
     """Return the spans of time that the training images [T, C] are means over."""
     ends = np.stack(measured, axis=1)
     lengths = (ends[:, :, 1] - ends[:, :, 0]).astype(np.float32)
     half = float(np.median(lengths[lengths > 0] if (lengths == 0).any() else lengths)) / 2
-    return Spans(torch.from_numpy(ends).to(device), half, scene.n_ticks)
+    doubtful = None
+    if any(own is not None for own in doubts):
+        none = np.zeros((len(ends), 4, *ends.shape[3:]), np.float16)
+        doubtful = torch.from_numpy(np.stack([none if own is None else own for own in doubts], 1)).to(device)
+    return Spans(torch.from_numpy(ends).to(device), half, scene.n_ticks, doubtful)
 
 
 def as_measured(scene: TrainingScene, ticks: Sequence[int], images: Float32) -> Float32:

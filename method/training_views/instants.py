@@ -8,6 +8,10 @@ model says of the difference is added to it:
 Where that holds for a model, its mean over the span is what was measured. So the fit has the same optimum as one that
 renders the whole span at each step, at the cost of one render. The model that corrects is a snapshot, taken anew a few
 times in a fit; repeated, this is van Cittert's deconvolution (1931), which starts from what was measured.
+
+The same model tells what a span's lost ticks held. Of a span that gathered k spikes for certain, and up to D more, the
+number is the one that comes nearest to the model's mean over it; where that is not near to a whole number, nothing was
+measured.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ from spike4dgs.method.splat.kernels.threads import work_alone
 from spike4dgs.method.training_views.training_images import Spans
 
 REACH = 2.0  # half spans from the instant, beyond which no span is followed
+UNSURE = 0.3  # spikes from a whole number, beyond which a model does not tell how many there were
 
 RenderViews = Callable[[float, Sequence[int]], Tensor]  # ticks from the instant, views -> [V, H, W], no gradient
 
@@ -42,6 +47,18 @@ def correction(before: Tensor, now: Tensor, after: Tensor, spans: Spans) -> Tens
     a, b = spans.ends.to(now).clamp(-reach, reach).unbind(1)
     slope, bend = (after - before) / (2 * far), (before + after - 2 * now) / (2 * far * far)
     return -(slope * (a + b) / 2 + bend * (a * a + a * b + b * b) / 3)
+
+
+def recount(mean: Tensor, doubts: Tensor) -> Tensor:
+    """Return what values lack of the spikes that a model's means over their spans, [V, H, W], tell.
+
+    `doubts` [V, 4, H, W] are those of `ImageMaker.with_spans`. NaN where the model does not tell.
+    """
+    most, one, without, counted = doubts.float().unbind(1)
+    spikes = (mean - without) / one
+    whole = spikes.round().clamp(min=0).minimum(most)
+    lacking = torch.where((spikes - whole).abs() > UNSURE, math.nan, whole * one - counted)
+    return torch.where(most > 0, lacking, 0.0)
 
 
 class Corrections:
@@ -110,4 +127,6 @@ class Corrections:
         far, render = node(self.spans.half), self.render(index)
         with torch.no_grad():
             before, now, after = (render(ticks, views) for ticks in (-far, 0.0, far))
-            return correction(before, now, after, self.spans.at(index).at(torch.tensor(views)))
+            spans = self.spans.at(index).at(torch.tensor(views))
+            change = correction(before, now, after, spans)
+            return change if spans.doubts is None else change + recount(now - change, spans.doubts)

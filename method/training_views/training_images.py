@@ -26,10 +26,12 @@ class Spans:
     ends: Tensor  # float16 [..., 2, H, W], the first and the last instant
     half: float  # half the median length
     n_ticks: int  # of the clip
+    doubts: Tensor | None = None  # float16 [..., 4, H, W], see `ImageMaker.with_spans`; None: no tick is lost
 
     def at(self, index: slice | int | Tensor) -> Spans:
         """Return the spans of some images."""
-        return replace(self, ends=self.ends[index])
+        doubts = None if self.doubts is None else self.doubts[index]
+        return replace(self, ends=self.ends[index], doubts=doubts)
 
 
 @dataclass(frozen=True, eq=False)

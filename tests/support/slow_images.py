@@ -18,7 +18,7 @@ from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows
-from spike4dgs.method.images.intervals import FOLLOWED, LEAST, MOVED, IntervalSettings
+from spike4dgs.method.images.intervals import IntervalSettings
 
 Spikes = NDArray[np.generic]
 Lost = NDArray[np.bool_] | None
@@ -123,12 +123,12 @@ def _slow_rates(spikes: Spikes, tick: int, halves: Float64, level: NDArray[np.in
 
 def slow_intervals(
     spikes: Spikes, tick: int, settings: IntervalSettings | None = None, lost: Lost = None
-) -> tuple[Float64, Float64]:
-    """Return the rates and the first and last instants of their spans [2, H, W] in ticks from `tick`."""
+) -> tuple[Float64, Float64, Float64]:
+    """Return the rates, the first and last instants of their spans [2, H, W] in ticks from `tick`, and their doubts."""
     s = settings or IntervalSettings()
     halves, level = half_windows(len(spikes), s), slow_levels(spikes, tick, s, lost)
     image, spans = _slow_rates(spikes, tick, halves, level, lost), np.empty((2, *spikes.shape[1:]))
-    spans[0], spans[1], doubt = -s.half, s.half, _of_pixels(spikes, lost)
+    spans[0], spans[1], doubt, doubts = -s.half, s.half, _of_pixels(spikes, lost), np.zeros((3, *image.shape))
     for y, x in np.ndindex(image.shape):
         window = float(halves[level[y, x]])
         if window >= s.still or level[y, x] == len(halves) - 1:
@@ -136,45 +136,22 @@ def slow_intervals(
         # Half a span is a float32 number: 4.000000000000001 would tell apart two spikes that are equally near.
         half = float(np.float32(min(s.half, max(s.shortest, window / s.growth))))
         if found := _measured(spikes[:, y, x], tick, half, doubt[:, y, x]):
-            image[y, x], spans[:, y, x] = found[0], found[1:]
-    return image, spans
+            image[y, x], spans[:, y, x], doubts[:, y, x] = found
+    return image, spans, doubts
 
 
-def _measured(spikes: Spikes, tick: int, half: float, doubt: NDArray[np.bool_]) -> tuple[float, float, float] | None:
-    """Return rate, first and last instant of a pixel's span; None with fewer than two certain spikes."""
+def _measured(
+    spikes: Spikes, tick: int, half: float, doubt: NDArray[np.bool_]
+) -> tuple[float, tuple[float, float], tuple[float, float, float]] | None:
+    """Return rate, span and doubts of a pixel; None with fewer than two certain spikes."""
     fired = _certain(spikes, doubt)
     found = _between_spikes(fired, tick - half, tick + half, tick)
     if found is None:
         return None
-    first, last = fired[list(found)]
-    length = last - first
-    if not (doubtful := doubt[first:last].sum()):
-        return _span(fired, *found, tick, length)
-    windows = []
-    numbers = np.cumsum(doubt)  # ticks of one run have one number
-    for number in np.unique(numbers[~doubt]):
-        run = np.flatnonzero((numbers == number) & ~doubt)
-        start, stop = run[0], run[-1] + 1
-        low, high = max(start, tick - (1 + MOVED) * half), min(stop, tick + (1 + MOVED) * half)
-        if high - low > 2 * half:
-            middle = min(max(tick, low + half), high - half)
-            low, high = middle - half, middle + half
-        inside = np.flatnonzero((fired >= start) & (fired < stop))
-        if high <= low or len(inside) < 2:
-            continue
-        i, j = (int(inside[np.argmin(abs(fired[inside] + 0.5 - end))]) for end in (low, high))
-        if i < j and max(tick - fired[i] - 0.5, fired[j] + 0.5 - tick) <= FOLLOWED * half:
-            windows.append((low - high, start, i, j))
-    if windows:
-        *_, i, j = min(windows)  # the longest, of equally long ones the first
-        if fired[j] - fired[i] >= LEAST * length:
-            return _span(fired, i, j, tick, fired[j] - fired[i])
-    return _span(fired, *found, tick, length - doubtful)
-
-
-def _span(fired: NDArray[np.int64], i: int, j: int, tick: int, ticks: float) -> tuple[float, float, float]:
-    """Return the rate in `ticks` between two spikes, and the span that they bound."""
-    return (j - i) / ticks, fired[i] + 0.5 - tick, fired[j] + 0.5 - tick
+    (i, j), (first, last) = found, fired[list(found)]
+    span, length, doubtful = (first + 0.5 - tick, last + 0.5 - tick), last - first, int(doubt[first:last].sum())
+    doubts = (doubtful, 1 / length, (j - i) / length) if doubtful else (0.0, 0.0, 0.0)
+    return (j - i) / (length - doubtful), span, doubts
 
 
 def _between_spikes(fired: NDArray[np.int64], start: float, stop: float, tick: int) -> tuple[int, int] | None:

@@ -90,8 +90,9 @@ def test_rates_and_spans_are_those_of_the_definition(n, bottom_up, half, still, 
     rates = rng.random((n, 4, 5)) ** 3 * rng.uniform(0, 1.2, (4, 5))
     spikes, tick = fire(rates, rng.random((4, 5))), int(rng.integers(n))
     s = IntervalSettings(half=half, still=still)
-    rate, spans = intervals(stream_of(spikes, bottom_up), tick, s)
-    slow_rate, slow_spans = slow_intervals(spikes, tick, s)
+    rate, spans, doubts = intervals(stream_of(spikes, bottom_up), tick, s)
+    slow_rate, slow_spans, _ = slow_intervals(spikes, tick, s)
+    assert doubts is None, "no tick is lost"
     np.testing.assert_allclose(rate, slow_rate, rtol=1e-6)
     np.testing.assert_allclose(spans, slow_spans, rtol=1e-6)
 
@@ -104,7 +105,7 @@ def test_settings_without_a_meaning_are_refused(wrong):
 
 def test_constant_light_keeps_the_long_windows_of_adaptive():
     spikes = fire(np.full((200, 6, 7), 0.3) * np.linspace(0.2, 2, 42).reshape(6, 7), np.full((6, 7), 0.4))
-    rate, spans = intervals(stream_of(spikes), 100)
+    rate, spans, _ = intervals(stream_of(spikes), 100)
     np.testing.assert_array_equal(rate, adaptive_image(stream_of(spikes), 100))
     half = IntervalSettings().half
     assert (spans[0] == -half).all() and (spans[1] == half).all()
@@ -117,7 +118,7 @@ def errors(n=160, half=10.0, seed=0):
     stream, by = stream_of(fire(rates, rng.random((24, 40)))), gathered(rates)
     found = []
     for tick in range(30, n - 30, 7):
-        rate, (first, last) = intervals(stream, tick, IntervalSettings(half=half))
+        rate, (first, last), _ = intervals(stream, tick, IntervalSettings(half=half))
         y, x = np.nonzero((first != -half) | (last != half))
         a, b = tick + first[y, x], tick + last[y, x]
         found.append((rate[y, x] - (by(b, y, x) - by(a, y, x)) / (b - a), rate[y, x], b - a))
@@ -145,7 +146,7 @@ def test_the_sooner_light_changes_the_shorter_the_span():
     n = 400
     rates = np.full((n, 20, 40), 0.6)  # still; and from the middle on, faster and faster to the right
     rates[:, :, 20:] = np.stack([sweeping(n, 20, 20, v)[:, :, 10] for v in np.linspace(0.02, 0.5, 20)], axis=2)
-    _, (first, last) = intervals(stream_of(fire(rates, np.random.default_rng(0).random((20, 40)))), 200)
+    _, (first, last), _ = intervals(stream_of(fire(rates, np.random.default_rng(0).random((20, 40)))), 200)
     length = np.median(last - first, axis=0)
     half = IntervalSettings().half
     assert (first[:, :18] == -half).all() and (last[:, :18] == half).all(), "constant light has no span of its own"
@@ -156,8 +157,9 @@ def test_the_sooner_light_changes_the_shorter_the_span():
 def test_the_maker_gives_images_and_spans():
     spikes = fire(sweeping(80, 12, 16, 0.2), np.random.default_rng(1).random((12, 16)))
     maker, stream = IMAGES["intervals"], stream_of(spikes)
-    images, spans = maker.with_spans(stream, [20, 40], 0.5)
-    rate, span = intervals(stream, 40)
+    images, spans, doubts = maker.with_spans(stream, [20, 40], 0.5)
+    rate, span, _ = intervals(stream, 40)
     np.testing.assert_allclose(images[1], rate / 0.5, rtol=1e-6)
     np.testing.assert_array_equal(spans[1], span)
+    assert doubts is None, "no tick is lost"
     assert IMAGES["adaptive"].with_spans(stream, [20], 0.5)[1] is None, "an instant"

@@ -111,7 +111,7 @@ def test_images_show_the_light_of_their_tick(maker) -> None:
 def test_a_still_pixel_has_an_empty_span_and_a_moving_one_its_own() -> None:
     stream = seen(flashes(), moving=0.5)
     light = shared(stream, gathered(flashes()))
-    _, spans = intervals(stream, 120, light=light)
+    _, spans, _ = intervals(stream, 120, light=light)
     lengths: Float32 = spans[1] - spans[0]
     assert (lengths[:, WIDTH // 2 + 2 :] == 0).mean() > 0.95
     assert (lengths[:, : WIDTH // 2 - 2] > 0).mean() > 0.95

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Sequence
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from spike4dgs.method.training_views.instants import REACH, Corrections, correction, node
+from spike4dgs.method.training_views.instants import REACH, Corrections, correction, node, recount
 from spike4dgs.method.training_views.training_images import Spans
 
 SHAPE = (2, 12, 16)
@@ -193,3 +194,14 @@ def test_a_render_that_fails_ahead_fails_where_it_is_asked_for() -> None:
     assert failed == [1]
     with pytest.raises(ArithmeticError, match="no such render"):
         corrections.at(1, [0])
+
+
+def test_a_span_holds_the_whole_number_of_spikes_that_comes_nearest_to_the_models_mean() -> None:
+    most, one, without, counted = 3.0, 0.0625, 0.5, 0.1
+    spikes = torch.tensor([-2.0, -0.2, 0.0, 0.29, 0.4, 0.6, 0.71, 2.0, 3.29, 3.4, 9.0])
+    doubts = torch.tensor([most, one, without, counted]).view(1, 4, 1, 1).expand(1, 4, 1, len(spikes)).half()
+    found = recount((without + one * spikes)[None, None], doubts)[0, 0]
+    nan = math.nan
+    expected = one * torch.tensor([nan, 0, 0, 0, nan, nan, 1, 2, 3, nan, nan]) - counted
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0, equal_nan=True)
+    assert not recount(torch.full((1, 2, 2), 0.3), torch.zeros(1, 4, 2, 2).half()).any(), "nothing is in doubt"
