@@ -22,7 +22,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.physics import from_settings, true_cameras
 from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
-from spike4dgs.generators.rendering.keyframes import read_arrays, write_arrays
+from spike4dgs.generators.rendering.keyframes import finite, read_arrays, write_arrays
 from spike4dgs.generators.rendering.lights.layers import Renderer, path_renderer
 from spike4dgs.generators.rendering.like_surfaces import join_soft
 from spike4dgs.generators.rendering.render import SoftStatic, StaticViews, anchor_s
@@ -163,7 +163,8 @@ class RenderKeys(_Task):
 
     def __call__(self, ticks: Sequence[int]) -> list[tuple[int, dict[str, NDArray[Any]]]]:
         """Return the keys of `ticks`."""
-        return [(tick, self._renderer.key_arrays(tick, plan_of(self.job))) for tick in ticks]
+        name, plan, render = f"{self.job.world}-{self.job.variant}, key frame", plan_of(self.job), self._renderer
+        return [(t, finite(lambda tick: render.key_arrays(tick, plan), t, f"{name} {t}")) for t in ticks]
 
 
 def key_chunks(job: Job, ticks: Sequence[int]) -> list[list[int]]:
@@ -212,7 +213,8 @@ class RenderTargets(_Task):
         t_s, everywhere = tick / RATE_HZ, tick in self.job.sparse_ticks
         renderer = self._every_view if everywhere else self._held_out
         views = range(len(cameras_of(self.job))) if everywhere else [held_out_view(self.job)]
-        images = (renderer.keys(t_s), renderer.moving_masks(t_s), *renderer.geometry(t_s, TARGET_EVERY / RATE_HZ))
+        keys = finite(renderer.keys, t_s, f"{self.job.world}-{self.job.variant}, target {tick}")
+        images = (keys, renderer.moving_masks(t_s), *renderer.geometry(t_s, TARGET_EVERY / RATE_HZ))
         return [Truth(view, tick, *one) for view, *one in zip(views, *images, strict=True)]
 
 

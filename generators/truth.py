@@ -36,7 +36,7 @@ from spike4dgs.generators.render_tasks import (
     world_of,
 )
 from spike4dgs.generators.rendering.image_motion import KeyPlan
-from spike4dgs.generators.rendering.keyframes import KeyStore
+from spike4dgs.generators.rendering.keyframes import KeyStore, finite
 from spike4dgs.generators.rendering.moving_array.renderer import MovingArrayRenderer, along
 from spike4dgs.generators.rendering.render import MultiViewRenderer, SoftStatic
 
@@ -254,12 +254,12 @@ def second_renderings(scene: Scene) -> tuple[Target, NDArray[np.float32], NDArra
     target, images = targets[len(targets) // 2], []
     print(f"rendering a target of {scene.id} twice more, to know its noise: about half a minute", file=sys.stderr)
     for seed in _SECOND_SEEDS:
-        rendered = second_truth(job, held_out_view(job), job.seed + seed)
-        image = rendered(target.tick / RATE_HZ) * np.float32(job.light_at(target.tick))
-        if not np.isfinite(image).all():  # as happened once, and not when the same was rendered again
+        rendered, name = second_truth(job, held_out_view(job), job.seed + seed), f"{scene.id}, {target.name}"
+        image = finite(rendered, target.tick / RATE_HZ, name)
+        if not np.isfinite(image).all():
             found = f"{np.count_nonzero(~np.isfinite(image))} pixels that are not"
-            raise problem(f"{scene.id}, {target.name}", "a finite second rendering", found, "submit again")
-        images.append(image)
+            raise problem(name, "a finite second rendering", found, "submit again")
+        images.append(image * np.float32(job.light_at(target.tick)))
     return target, images[0], images[1]
 
 

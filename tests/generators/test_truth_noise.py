@@ -12,6 +12,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.generators import truth as renderings
 from spike4dgs.generators.profiles import RATE_HZ, SPLIT_PROFILES, Job
 from spike4dgs.generators.render_tasks import RenderTargets, cameras_of, renderer_of
+from spike4dgs.generators.rendering.keyframes import finite
 from spike4dgs.generators.truth import second_renderings, second_truth
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db, noise_share
 
@@ -44,6 +45,17 @@ def test_a_second_rendering_with_a_pixel_that_is_no_number_is_refused(
     monkeypatch.setattr(renderings, "second_truth", lambda *_: lambda _: image)
     with pytest.raises(UserError, match=r"car-0-tiny.*finite second rendering, found 1 pixels that are not"):
         second_renderings(scene)
+
+
+def test_a_pixel_that_is_no_number_once_is_rendered_again(capsys: pytest.CaptureFixture[str]) -> None:
+    image, torn = np.ones((4, 5), np.float32), np.ones((4, 5), np.float32)
+    torn[2, 3] = np.nan
+    for good, bad in ((image, torn), ({"given0": np.ones(3, bool), "values0": image}, {"values0": torn})):
+        made = [good, bad]
+        assert finite(lambda _, made=made: made.pop(), 0.5, "car-0, key frame 28") is good
+        assert capsys.readouterr().err == "car-0, key frame 28: a pixel is no number; rendered again\n"
+        assert finite(lambda _, good=good: good, 0.5, "car-0") is good and not capsys.readouterr().err
+    assert finite(lambda _: torn, 0.5, "the world's fault") is torn
 
 
 @pytest.mark.slow
