@@ -39,6 +39,8 @@ def test_nothing_stretches(beat):
     np.testing.assert_allclose(chords, np.broadcast_to(chords[0], chords.shape), atol=1e-12)
     spans = np.linalg.norm(np.diff(wings, axis=1), axis=-1).sum(1)  # [25, lines]
     assert (np.ptp(spans, axis=0) / spans.mean(0)).max() < 0.08
+    front = np.linalg.norm(np.diff(wings[:, :, 0, 1:], axis=1), axis=-1).sum(1)
+    np.testing.assert_allclose(front, bird_body.SPAN_M, rtol=1e-6)
     tails = np.stack([bird_body.tail_points(beat, t).reshape(21, 9, 3) for t in np.linspace(0, 1 / beat.hz, 25)])
     feathers = np.linalg.norm(tails[:, :, -1] - tails[:, :, 0], axis=-1)
     assert (np.ptp(feathers, axis=0) / feathers.mean(0)).max() < 0.03

@@ -53,13 +53,11 @@ def test_the_world_is_found_beside_our_own(installed: Path) -> None:
 
 @pytest.mark.slow
 def test_it_passes_the_tests_of_the_worlds(installed: Path) -> None:
-    # Not this file: it would install the package once more, and clear away the temporary folders of earlier runs.
-    chosen = f"pinwheel and not {Path(__file__).name}"
-    options = ("-n", "0", "-p", "no:cacheprovider", "-k", chosen)
-    done = python(installed, "-m", "pytest", *options, str(Path(__file__).parent))
+    tests = Path(__file__).with_name("test_worlds.py")
+    done = python(installed, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "-k", "pinwheel", str(tests))
     assert done.returncode == 0, done.stdout + done.stderr
     (passed,) = re.findall(r"(\d+) passed", done.stdout)
-    assert int(passed) >= 8, "not without a test"
+    assert int(passed) >= 7, "not without a test"
 
 
 @pytest.mark.parametrize("first", ["pinwheel_world", "spike4dgs.generators.worlds"])

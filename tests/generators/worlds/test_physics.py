@@ -155,15 +155,19 @@ def local_points(path: Trajectory, t_s: float, points: np.ndarray) -> np.ndarray
 
 
 @pytest.mark.parametrize(("name", "variant"), CASES)
-def test_bodies_do_not_enter_each_other_or_the_table(name, variant):
+def test_bodies_stay_rigid_and_do_not_enter_each_other_or_the_table(name, variant):
     world, bodies, path = simulated(name, variant)
     (surface,) = world.deforming.values()
     count = len(bodies) - len(world.instances)
-    others = ~np.eye(count, dtype=bool)
+    assert surface.bodies.max() == count - 1
+    others, every, shape = ~np.eye(count, dtype=bool), np.arange(count), None
     for t in np.linspace(0, 0.1, 41):
         points = surface.vertices(t).reshape(count, -1, 3)
         assert points[..., 2].min() > -SOFT_M
-        seen = np.abs(local_points(Trajectory(path.start_s, *_first(path, count)), t, points))
+        seen = local_points(Trajectory(path.start_s, *_first(path, count)), t, points)
+        shape = seen[every, every] if shape is None else shape
+        np.testing.assert_allclose(seen[every, every], shape, atol=1e-9)
+        seen = np.abs(seen)
         if name == "bricks":
             depth = (np.array(bricks.BRICK_M) / 2 - seen).min(-1)
         else:
@@ -245,10 +249,7 @@ def test_nothing_jumps(name, variant, fastest_m_s):
 
 @pytest.mark.parametrize("name", ["bricks", "chips"])
 def test_the_same_arguments_give_the_same_bits(name):
-    simulated.cache_clear()
-    first = simulated(name, 1, 0.02)[2]
-    simulated.cache_clear()
-    again = simulated(name, 1, 0.02)[2]
+    first, again = (simulated.__wrapped__(name, 1, 0.02)[2] for _ in range(2))
     np.testing.assert_array_equal(first.positions, again.positions)
     np.testing.assert_array_equal(first.quaternions, again.quaternions)
 
@@ -292,8 +293,7 @@ def test_the_ball_flies_on_one_arc_before_and_after_the_simulation_begins():
     assert min(heights) > bricks.BALL_M - SOFT_M
 
 
-@pytest.mark.parametrize("duration_s", [0.004, 0.02, 0.1, 0.5])
-@pytest.mark.parametrize("variant", [0, 3])
+@pytest.mark.parametrize(("variant", "duration_s"), [(0, 0.004), (0, 0.02), (0, 0.1), (3, 0.02), (3, 0.5)])
 def test_most_chips_are_in_the_air_in_the_middle_of_the_clip(variant, duration_s):
     world, bodies, path = simulated("chips", variant, duration_s)
     low = world.deforming["chip"].vertices(duration_s / 2).reshape(len(bodies), -1, 3)[..., 2].min(1)
