@@ -15,6 +15,7 @@ from spike4dgs.cli.season import make
 
 @pytest.fixture(scope="session")
 def once(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A season that is made, and not scored; no test changes it."""
     made = Made(tmp_path_factory.mktemp("season"))
     with pytest.MonkeyPatch.context() as patch:
         render_fakes(patch)
@@ -32,6 +33,7 @@ def made(once: Made, tmp_path: Path) -> Made:
 
 @pytest.fixture(scope="session")
 def scored_once(once: Made, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A season with two results; no test changes it."""
     copy = Made(Path(shutil.copytree(once.root, tmp_path_factory.mktemp("scored") / "copy")))
     assert copy.score("counts", "rough") == 0
     return copy

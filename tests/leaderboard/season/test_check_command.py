@@ -21,14 +21,17 @@ from spike4dgs.leaderboard.season.season_file import OPENING_NAME, draw_opening,
 SCENE = "car-9003-tiny"
 
 
-@pytest.fixture
-def over(scored: Made) -> Made:
-    """A season that is revealed; in `scenes` are its scenes as folders and tars."""
-    assert reveal(NUMBER, secret=scored.secret, seasons=scored.seasons) == 0
-    shutil.copytree(scored.secret / "scenes", scored.root / "scenes")
-    for pack in (scored.secret / "packs").iterdir():
-        shutil.copy(pack, scored.root / "scenes")
-    return scored
+@pytest.fixture(scope="module")
+def over(scored_once: Made, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A season that is revealed, which no test changes; in `scenes` are its scenes as folders and tars."""
+    root = tmp_path_factory.mktemp("over")
+    shutil.copytree(scored_once.seasons, root / "seasons")
+    assert reveal(NUMBER, secret=scored_once.secret, seasons=root / "seasons") == 0
+    shutil.copytree(scored_once.secret / "scenes", root / "scenes")
+    for pack in (scored_once.secret / "packs").iterdir():
+        shutil.copy(pack, root / "scenes")
+    (root / "runs").symlink_to(scored_once.root / "runs")
+    return Made(root)
 
 
 def checked(made: Made, **options: Any) -> int:
@@ -61,24 +64,24 @@ def test_season_0_is_revealed_and_right(capsys: pytest.CaptureFixture[str]) -> N
     assert "ok: the seeds of 2 scenes" in out and "ok: 3 results" in out
 
 
-def test_before_the_reveal_nothing_secret_is_shown(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
-    assert checked(made, scenes=None) == 0
+def test_before_the_reveal_nothing_secret_is_shown(once: Made, capsys: pytest.CaptureFixture[str]) -> None:
+    assert checked(once, scenes=None) == 0
     out = capsys.readouterr().out
-    assert made.season.opening_sha256 in out and "ok: " not in out
-    assert not [s for s in read_opening(made.secret / OPENING_NAME).scenes if s.seed in out]
+    assert once.season.opening_sha256 in out and "ok: " not in out
+    assert not [s for s in read_opening(once.secret / OPENING_NAME).scenes if s.seed in out]
 
 
 def test_a_scene_made_again_from_its_seed_is_the_committed_one(
-    over: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    over: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     render_fakes(monkeypatch)
     for seed in read_opening(over.public / OPENING_NAME).scenes:
         settings = SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=seed.rendering)
-        make_dataset([settings.job(seed.world)], over.root / "again")
-    assert checked(over, scenes=over.root / "again") == 0
+        make_dataset([settings.job(seed.world)], tmp_path / "again")
+    assert checked(over, scenes=tmp_path / "again") == 0
     assert capsys.readouterr().out.count("is the scene committed to") == 2
-    make_dataset([SceneSettings("tiny", int(seed.seed) ^ 1, 9003).job("car")], over.root / "wrong")
-    assert checked(over, scenes=over.root / "wrong", predictions=None) == 2
+    make_dataset([SceneSettings("tiny", int(seed.seed) ^ 1, 9003).job("car")], tmp_path / "wrong")
+    assert checked(over, scenes=tmp_path / "wrong", predictions=None) == 2
     assert "render other bytes" in capsys.readouterr().err
 
 
@@ -151,38 +154,52 @@ def predictions(over: Made) -> None:
 
 
 COUNTS = "results/counts.json"
-FORGED: dict[str, tuple[Callable[[Made], None], str]] = {
-    "seed": (changed(OPENING_NAME, lambda d: d["scenes"][0].update(seed="1")), "as committed"),
-    "salt": (changed(OPENING_NAME, lambda d: d.update(salt="0" * 64)), "as committed"),
-    "other opening": (other_opening, "as committed"),
-    "world": (changed("season.json", lambda d: d["scenes"][0].update(world="van")), "as in season.json"),
-    "code": (changed("season.json", lambda d: d["harness"].update(commit="0" * 40)), "as in season.json"),
-    "stream": (stream, "cam_04.dat: expected sha256"),
-    "stream and manifest": (stream_and_manifest, "expected revision"),
-    "truth": (truth_behind_an_honest_manifest, "the manifest claims another content"),
-    "source's seed": (source_seed, "as revealed"),
+# What is changed, its folder, and what the check then says. It gets no more of the season than finds the change.
+FORGED: dict[str, tuple[Callable[[Made], None], str, str]] = {
+    "seed": (changed(OPENING_NAME, lambda d: d["scenes"][0].update(seed="1")), "seasons", "as committed"),
+    "salt": (changed(OPENING_NAME, lambda d: d.update(salt="0" * 64)), "seasons", "as committed"),
+    "other opening": (other_opening, "seasons", "as committed"),
+    "world": (changed("season.json", lambda d: d["scenes"][0].update(world="van")), "seasons", "as in season.json"),
+    "code": (changed("season.json", lambda d: d["harness"].update(commit="0" * 40)), "seasons", "as in season.json"),
+    "stream": (stream, "scenes", "cam_04.dat: expected sha256"),
+    "stream and manifest": (stream_and_manifest, "scenes", "expected revision"),
+    "truth": (truth_behind_an_honest_manifest, "scenes", "the manifest claims another content"),
+    "source's seed": (source_seed, "scenes", "as revealed"),
     "training part": (
         changed("season.json", lambda d: d["scenes"][0].update(training_revision="0" * 64)),
+        "scenes",
         "expected a training part of revision 0000",
     ),
-    "tar": (tar, f"{SCENE}.tar: expected sha256"),
-    "value": (value, "as computed from the files"),
-    "mean": (changed(COUNTS, lambda d: d["record"]["mean"].update(psnr=60.0)), "the mean of its parts"),
+    "tar": (tar, "scenes", f"{SCENE}.tar: expected sha256"),
+    "value": (value, "runs", "as computed from the files"),
+    "mean": (changed(COUNTS, lambda d: d["record"]["mean"].update(psnr=60.0)), "seasons", "the mean of its parts"),
     "other scenes": (
         changed(COUNTS, lambda d: d["record"]["dataset"]["scenes"].update({SCENE: "0" * 64})),
+        "seasons",
         "expected scores of the committed",
     ),
-    "table": (table, "expected the table of the results"),
-    "missing row": (missing_row, "expected the table of the results"),
-    "predictions": (predictions, "expected predictions"),
+    "table": (table, "seasons", "expected the table of the results"),
+    "missing row": (missing_row, "seasons", "expected the table of the results"),
+    "predictions": (predictions, "runs", "expected predictions"),
 }
 
 
-@pytest.mark.parametrize(("forge", "message"), FORGED.values(), ids=FORGED)
+@pytest.mark.parametrize(("forge", "folder", "message"), FORGED.values(), ids=FORGED)
 def test_every_forged_part_is_caught(
-    forge: Callable[[Made], None], message: str, over: Made, capsys: pytest.CaptureFixture[str]
+    forge: Callable[[Made], None],
+    folder: str,
+    message: str,
+    over: Made,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    forge(over)
+    for name in ("seasons", "scenes", "runs"):  # a forgery changes its folder and the public files alone
+        if name in ("seasons", folder):
+            shutil.copytree(over.root / name, tmp_path / name)
+        else:
+            (tmp_path / name).symlink_to(over.root / name)
+    forge(Made(tmp_path))
     capsys.readouterr()
-    assert checked(over) == 2
+    needless: dict[str, Any] = {"seasons": {"scenes": None, "predictions": None}, "scenes": {"predictions": None}}
+    assert checked(Made(tmp_path), **needless.get(folder, {})) == 2
     assert message in capsys.readouterr().err

@@ -26,28 +26,28 @@ def command(made: Made, worlds: tuple[str, ...] = WORLDS, number: int = NUMBER, 
     return make(number, worlds=worlds, **given)
 
 
-def test_the_commitments_are_those_of_what_was_made(made: Made) -> None:
-    season, drawn = made.season, read_opening(made.secret / OPENING_NAME)
-    assert season.opening_sha256 == sha256_file(made.secret / OPENING_NAME)
+def test_the_commitments_are_those_of_what_was_made(once: Made) -> None:
+    season, drawn = once.season, read_opening(once.secret / OPENING_NAME)
+    assert season.opening_sha256 == sha256_file(once.secret / OPENING_NAME)
     assert [s.id for s in season.scenes] == ["car-9003-tiny", "turntable-9003-tiny"] == [s.scene for s in drawn.scenes]
     for scene, seed in zip(season.scenes, drawn.scenes, strict=True):
-        whole = open_scene(scene_folder(made.secret, scene.id))
+        whole = open_scene(scene_folder(once.secret, scene.id))
         assert str(whole.meta["source"]["seed"]) == seed.seed
         assert seed.rendering == "paths" and "soft" not in whole.meta["source"]["sampling"]
         assert (scene.revision, scene.pack_sha256) == (
             whole.revision,
-            sha256_file(pack_file(made.secret, scene.id, training=False)),
+            sha256_file(pack_file(once.secret, scene.id, training=False)),
         )
-        part = open_scene(training_folder(made.secret, scene.id))
+        part = open_scene(training_folder(once.secret, scene.id))
         assert scene.training_revision == part.revision != whole.revision
-        assert scene.training_pack_sha256 == sha256_file(pack_file(made.secret, scene.id, training=True))
+        assert scene.training_pack_sha256 == sha256_file(pack_file(once.secret, scene.id, training=True))
     assert season.rendered_on["mitsuba_variant"] == "fake" and season.rendered_on["cpu"]
     assert (season.streams, season.budget, season.fit_seed, season.closes) == ("published", "0.02", 0, None)
 
 
-def test_no_secret_is_in_the_public_folder(made: Made) -> None:
-    drawn, public = read_opening(made.secret / OPENING_NAME), b"".join(files_in(made.seasons).values()).decode()
-    assert list(files_in(made.seasons)) == [f"{NUMBER}/season.json"]
+def test_no_secret_is_in_the_public_folder(once: Made) -> None:
+    drawn, public = read_opening(once.secret / OPENING_NAME), b"".join(files_in(once.seasons).values()).decode()
+    assert list(files_in(once.seasons)) == [f"{NUMBER}/season.json"]
     for secret in (drawn.salt, *(s.seed for s in drawn.scenes)):
         assert secret not in public and f"{int(secret, 16 if secret == drawn.salt else 10):x}" not in public
 
@@ -76,10 +76,10 @@ def test_a_killed_run_goes_on_with_its_seeds(tmp_path: Path, monkeypatch: pytest
     assert made.season.opening_sha256 == sha256_file(made.secret / OPENING_NAME)
 
 
-def test_two_processes_do_not_make_one_season(made: Made) -> None:
+def test_two_processes_do_not_make_one_season(once: Made) -> None:
     message = "expected a folder in which nobody else makes a season, found a run in progress"
-    with locked(made.secret / ".lock", "x", "free"), pytest.raises(UserError, match=message):
-        command(made)
+    with locked(once.secret / ".lock", "x", "free"), pytest.raises(UserError, match=message):
+        command(once)
 
 
 def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
@@ -105,9 +105,9 @@ def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]
         ({"budget": "much"}, "--budget: expected"),
     ],
 )
-def test_other_arguments_are_refused(options: dict[str, Any], message: str, made: Made) -> None:
+def test_other_arguments_are_refused(options: dict[str, Any], message: str, once: Made) -> None:
     with pytest.raises(UserError, match=message):
-        command(made, **options)
+        command(once, **options)
 
 
 def test_another_version_of_the_code_does_not_finish_a_season(made: Made) -> None:

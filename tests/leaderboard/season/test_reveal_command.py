@@ -26,10 +26,10 @@ def test_the_revealed_file_is_what_was_committed_to(scored: Made) -> None:
     assert sha256_file(scored.public / OPENING_NAME) == scored.season.opening_sha256
 
 
-def test_nothing_is_revealed_before_scores(made: Made) -> None:
+def test_nothing_is_revealed_before_scores(once: Made) -> None:
     with pytest.raises(UserError, match="expected results, found none; score the submissions first"):
-        reveal(NUMBER, secret=made.secret, seasons=made.seasons)
-    assert not (made.public / OPENING_NAME).exists()
+        reveal(NUMBER, secret=once.secret, seasons=once.seasons)
+    assert not (once.public / OPENING_NAME).exists()
 
 
 @pytest.mark.parametrize("days", [0, 3])

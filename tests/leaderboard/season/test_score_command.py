@@ -21,20 +21,20 @@ from spike4dgs.leaderboard.season.results import predict_all, read_results, writ
 from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
 
 
-def test_scores_are_those_of_whole_scenes(scored: Made, tmp_path: Path) -> None:
+def test_scores_are_those_of_whole_scenes(scored_once: Made, tmp_path: Path) -> None:
     """The same method, fitted on the whole scenes by `run-benchmark`, has the same scores to the last bit."""
-    whole = [scene_folder(scored.secret, s.id) for s in scored.season.scenes]
+    whole = [scene_folder(scored_once.secret, s.id) for s in scored_once.season.scenes]
     expected = run(tmp_path / "out", whole, CountMethod("counts"), CountMethod("rough", steps=1), budget=Budget(0.5))
-    found = {r.name: r.record for r in read_results(scored.seasons, scored.season)}
+    found = {r.name: r.record for r in read_results(scored_once.seasons, scored_once.season)}
     for record in expected:
         mine = found[record["method"]["name"]]
         assert mine["mean"] == record["mean"] and mine["dataset"] == record["dataset"]
 
 
-def test_the_psnr_is_that_of_the_files(scored: Made) -> None:
-    (result,) = (r for r in read_results(scored.seasons, scored.season) if r.name == "counts")
-    for scene in (open_scene(scene_folder(scored.secret, s.id)) for s in scored.season.scenes):
-        predictions = open_predictions(scored.root / "runs/predictions/counts" / scene.id, scene.targets)
+def test_the_psnr_is_that_of_the_files(scored_once: Made) -> None:
+    (result,) = (r for r in read_results(scored_once.seasons, scored_once.season) if r.name == "counts")
+    for scene in (open_scene(scene_folder(scored_once.secret, s.id)) for s in scored_once.season.scenes):
+        predictions = open_predictions(scored_once.root / "runs/predictions/counts" / scene.id, scene.targets)
         values = []
         for t in scene.targets:  # linear radiance, clipped to [0, 1]
             a, b = (np.clip(x.astype(np.float64), 0, 1) for x in (scene.ground_truth(t), predictions.read(t)))
@@ -42,22 +42,22 @@ def test_the_psnr_is_that_of_the_files(scored: Made) -> None:
         assert result.record["scenes"][scene.id]["metrics"]["psnr"] == pytest.approx(np.mean(values), abs=1e-6)
 
 
-def test_the_table_ranks_by_psnr(scored: Made) -> None:
-    results = read_results(scored.seasons, scored.season)
+def test_the_table_ranks_by_psnr(scored_once: Made) -> None:
+    results = read_results(scored_once.seasons, scored_once.season)
     psnr = [r.record["mean"]["psnr"] for r in results]
     assert psnr == sorted(psnr, reverse=True) and len(psnr) == 2
-    rows = [line for line in (scored.public / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
+    rows = [line for line in (scored_once.public / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
     assert [row.split(" | ")[:4] for row in rows] == [
         [f"| {i}", r.name, "predictions", f"{r.record['mean']['psnr']:.2f}"] for i, r in enumerate(results, start=1)
     ]
 
 
 @pytest.mark.parametrize("name", ["Counts", "co.unts", "COUNTS_"])
-def test_a_name_that_is_written_in_another_way_is_the_same(scored: Made, name: str) -> None:
-    (result,) = (r for r in read_results(scored.seasons, scored.season) if r.name == "counts")
+def test_a_name_that_is_written_in_another_way_is_the_same(scored_once: Made, name: str) -> None:
+    (result,) = (r for r in read_results(scored_once.seasons, scored_once.season) if r.name == "counts")
     record = {**result.record, "method": {**result.record["method"], "name": name}}
     with pytest.raises(UserError, match="a name that differs in letters or digits, found counts"):
-        write_result(scored.seasons, NUMBER, replace(result, record=record))
+        write_result(scored_once.seasons, NUMBER, replace(result, record=record))
 
 
 def test_a_name_is_scored_once(scored: Made, capsys: pytest.CaptureFixture[str]) -> None:
@@ -96,7 +96,7 @@ def test_a_scene_without_predictions_is_not_left_out(made: Made) -> None:
     assert "\n| - | counts | predictions | - |" in (made.public / "table.md").read_text()
 
 
-def test_a_method_gets_the_training_part_alone(made: Made) -> None:
+def test_a_method_gets_the_training_part_alone(once: Made, tmp_path: Path) -> None:
     seen = []
 
     class Looking(CountMethod):
@@ -104,8 +104,8 @@ def test_a_method_gets_the_training_part_alone(made: Made) -> None:
             seen.append((scene.revision, request.budget.scale))
             return super().fit(scene, request)
 
-    predict_all(open_committed(made.secret, made.season, training=True), [Looking("l")], Settings(made.root / "o"))
-    assert [r for r, _ in seen] == [s.training_revision for s in made.season.scenes]
+    predict_all(open_committed(once.secret, once.season, training=True), [Looking("l")], Settings(tmp_path / "out"))
+    assert [r for r, _ in seen] == [s.training_revision for s in once.season.scenes]
 
 
 def test_installed_methods_are_run_and_scored(made: Made) -> None:
@@ -115,19 +115,19 @@ def test_installed_methods_are_run_and_scored(made: Made) -> None:
     assert {cell["budget"] for cell in result.record["scenes"].values()} == {0.02}
 
 
-def test_a_failing_method_is_named(made: Made) -> None:
-    scenes = open_committed(made.secret, made.season, training=True)
+def test_a_failing_method_is_named(once: Made, tmp_path: Path) -> None:
+    scenes = open_committed(once.secret, once.season, training=True)
     bad = FailingMethod("bad", ValueError("no luck"))
-    assert predict_all(scenes, [bad, CountMethod("good")], Settings(made.root / "out")) == {"bad"}
-    assert "no luck" in (made.root / "out/logs/bad__car-9003-tiny.log").read_text()
-    assert (made.root / "out/predictions/good/car-9003-tiny").is_dir()
+    assert predict_all(scenes, [bad, CountMethod("good")], Settings(tmp_path / "out")) == {"bad"}
+    assert "no luck" in (tmp_path / "out/logs/bad__car-9003-tiny.log").read_text()
+    assert (tmp_path / "out/predictions/good/car-9003-tiny").is_dir()
 
 
-def test_two_processes_do_not_score_one_season(made: Made) -> None:
+def test_two_processes_do_not_score_one_season(once: Made) -> None:
     message = "expected a folder in which nobody else scores, found a run in progress"
-    with locked(made.secret / ".lock", "x", "free"), pytest.raises(UserError, match=message):
-        made.score("counts")
-    assert not read_results(made.seasons, made.season)
+    with locked(once.secret / ".lock", "x", "free"), pytest.raises(UserError, match=message):
+        once.score("counts")
+    assert not read_results(once.seasons, once.season)
 
 
 def test_nothing_is_scored_after_the_reveal(scored: Made) -> None:
@@ -142,9 +142,9 @@ def test_hidden_streams_take_methods_only(made: Made) -> None:
         made.score("counts")
 
 
-def test_nothing_to_score_is_an_error(made: Made) -> None:
+def test_nothing_to_score_is_an_error(once: Made) -> None:
     with pytest.raises(UserError, match="expected --predictions or --methods, found neither"):
-        made.score()
+        once.score()
 
 
 @pytest.mark.parametrize("folder", [scene_folder, training_folder])

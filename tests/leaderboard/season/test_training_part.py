@@ -28,13 +28,13 @@ DESCRIPTIONS = ("scene.json", "manifest.json", "targets.json", "croissant.json",
 
 
 @pytest.fixture
-def whole(made: Made) -> Scene:
-    return open_scene(scene_folder(made.secret, SCENE))
+def whole(once: Made) -> Scene:
+    return open_scene(scene_folder(once.secret, SCENE))
 
 
 @pytest.fixture
-def part(made: Made) -> Scene:
-    return open_scene(training_folder(made.secret, SCENE))
+def part(once: Made) -> Scene:
+    return open_scene(training_folder(once.secret, SCENE))
 
 
 def test_no_byte_of_the_truth_is_in_it(whole: Scene, part: Scene) -> None:
@@ -55,9 +55,9 @@ def test_no_byte_of_the_truth_is_in_it(whole: Scene, part: Scene) -> None:
         assert hashlib.sha256(data).hexdigest().encode() not in everything, f"not even the hash of {name}"
 
 
-def test_the_seed_is_not_in_it(made: Made, part: Scene) -> None:
-    drawn = read_opening(made.secret / OPENING_NAME)
-    everything = b"".join(files_in(training_folder(made.secret, SCENE)).values())
+def test_the_seed_is_not_in_it(once: Made, part: Scene) -> None:
+    drawn = read_opening(once.secret / OPENING_NAME)
+    everything = b"".join(files_in(training_folder(once.secret, SCENE)).values())
     for seed in drawn.scenes:
         assert seed.seed.encode() not in everything
         for order in ("little", "big"):
@@ -91,8 +91,8 @@ def test_what_is_kept_back_is_a_clear_error(part: Scene) -> None:
         open_scene(part.root, split="corner")
 
 
-def test_predictions_of_it_are_scored_without_truth(made: Made, part: Scene) -> None:
-    folder = made.root / "runs/predictions/counts" / SCENE
+def test_predictions_of_it_are_scored_without_truth(once: Made, part: Scene) -> None:
+    folder = once.root / "runs/predictions/counts" / SCENE
     cell = score_scene(open_for(folder, part), part, select_metrics(("psnr", "ssim", "brisque")))
     assert cell["metrics"]["psnr"] is None and cell["metrics"]["brisque"] is not None
 
@@ -114,7 +114,8 @@ def test_equal_scenes_have_equal_parts_and_others_do_not(whole: Scene, part: Sce
     assert write_training_part(open_scene(copy), tmp_path / "other").revision != part.revision
 
 
-def test_other_sensors_of_training_cameras_are_in_it(whole: Scene) -> None:
+def test_other_sensors_of_training_cameras_are_in_it(made: Made) -> None:
+    whole = open_scene(scene_folder(made.secret, SCENE))
     for camera in ("cam_00", "cam_04"):
         for name in (f"conventional/{camera}/000000.png", f"calibration/maps/{camera}.npz"):
             (whole.root / name).parent.mkdir(parents=True, exist_ok=True)
