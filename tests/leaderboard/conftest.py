@@ -1,4 +1,4 @@
-"""Fixtures of the leaderboard's tests: a finished run, made once, and a copy that a test may damage."""
+"""Fixtures of the leaderboard's tests: a finished run, made once, and copies that a test may damage."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from dummy_methods import CountMethod, FailingMethod, run
 from small_scenes import write_small_scene
+from submissions import enter
 
 from spike4dgs.benchmark import plugins
 
@@ -28,6 +29,19 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def done(finished: Path, tmp_path: Path) -> Path:
     """A copy of the run that a test may damage."""
     return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+@pytest.fixture(scope="session")
+def entered_once(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    copy = Path(shutil.copytree(finished, tmp_path_factory.mktemp("entered") / "run"))
+    enter(copy)
+    return copy
+
+
+@pytest.fixture
+def entered(entered_once: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may damage, with an entry of tfp+4dgs in `board`."""
+    return Path(shutil.copytree(entered_once, tmp_path / "run"))
 
 
 @pytest.fixture

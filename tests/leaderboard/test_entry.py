@@ -33,13 +33,12 @@ from spike4dgs.leaderboard.reading import read_entries
         (lambda e: e["record"]["mean"].update(psnr=50.0), "expected psnr ="),
     ],
 )
-def test_damaged_entries_are_refused_by_name_and_block_nobody(done: Path, change: Any, message: str) -> None:
-    path = enter(done)
-    edit_with_ledger(path, change)
-    enter(done, "rough")
-    (only,) = board(done)["boards"]
+def test_damaged_entries_are_refused_by_name_and_block_nobody(entered: Path, change: Any, message: str) -> None:
+    edit_with_ledger(entry_of(entered), change)
+    enter(entered, "rough", verified=False)
+    (only,) = board(entered)["boards"]
     assert [r["method"] for r in only["rows"]] == ["rough"]
-    (refused,) = board(done)["refused"]
+    (refused,) = board(entered)["refused"]
     assert refused["entry"].endswith("tfp+4dgs.json") and message in refused["reason"]
 
 
@@ -55,22 +54,21 @@ def test_a_label_that_was_edited_by_hand_is_noticed(done: Path, capsys: pytest.C
     assert read(enter(done, replace=True))["verification"]["label"] == "re-scored"
 
 
-def test_a_damaged_ledger_is_an_error_with_its_line(done: Path) -> None:
-    enter(done)
-    ledger = done / "board/LEDGER"
+def test_a_damaged_ledger_is_an_error_with_its_line(entered: Path) -> None:
+    ledger = entered / "board/LEDGER"
     ledger.write_text(ledger.read_text() + "not a line\n")
     with pytest.raises(UserError, match=r"LEDGER: expected lines of a sha256.* found line 2: 'not a line'"):
-        enter(done, "rough")
+        enter(entered, "rough")
 
 
-def test_half_written_files_of_killed_processes_block_nobody(done: Path) -> None:
-    path = enter(done)
+def test_half_written_files_of_killed_processes_block_nobody(entered: Path) -> None:
+    path = entry_of(entered)
     for part in (path.with_name(".rough.part.json"), path.with_name(".tfp+4dgs.77.part.json")):
         part.write_text('{"half":')
-    (done / "board/.leaderboard.9.part.json").write_text("{")
-    enter(done, "rough")
-    assert len(board(done)["boards"][0]["rows"]) == 2 and not board(done)["refused"]
-    assert not [name for name in files_in(done / "board") if ".part" in name]
+    (entered / "board/.leaderboard.9.part.json").write_text("{")
+    enter(entered, "rough")
+    assert len(board(entered)["boards"][0]["rows"]) == 2 and not board(entered)["refused"]
+    assert not [name for name in files_in(entered / "board") if ".part" in name]
 
 
 @pytest.mark.parametrize("name", ["../../evil", "a/b", "..", ".hidden", "", "a\n", "CON", "aux.v2", "name.", "x" * 101])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from dummy_methods import CountMethod, run
 from small_scenes import write_small_scene
-from submissions import edit_with_ledger, enter, read, submit
+from submissions import edit_with_ledger, entry_of, read, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.predictions import read_info
@@ -69,8 +69,8 @@ def test_a_record_without_the_mark_does_not_fit_its_predictions(ran: Path) -> No
         submit(record_of(ran), predictions=predictions, scenes=(ran / "s0",), leaderboard=ran / "board")
 
 
-def test_an_entry_that_was_put_into_the_folder_is_refused_by_who_reads_it(done: Path) -> None:
-    path = enter(done)
+def test_an_entry_that_was_put_into_the_folder_is_refused_by_who_reads_it(entered: Path) -> None:
+    path = entry_of(entered)
     edit_with_ledger(path, lambda entry: entry["record"]["method"].update(oracle=["images", "steps"]))
     with pytest.raises(UserError, match=REFUSED):
         read(path)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from changes import edit_json
 from dummy_methods import CountMethod, run
-from submissions import Record, board, enter, read, release_of, submit
+from submissions import Record, board, enter, entry_of, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
@@ -163,11 +163,10 @@ def test_a_method_with_one_failed_scene_is_not_ranked(done: Path, capsys: pytest
     assert "not ranked (pattern-1 failed)" in capsys.readouterr().out
 
 
-def test_only_records_of_one_dataset_compare(done: Path) -> None:
-    enter(done)
-    run(done / "single", [done / "s1"], CountMethod("other"))
-    submit(done / "single/results/other.json", leaderboard=done / "board")
-    names = [(b["dataset"]["name"], [r["method"] for r in b["rows"]]) for b in board(done)["boards"]]
+def test_only_records_of_one_dataset_compare(entered: Path) -> None:
+    run(entered / "single", [entered / "s1"], CountMethod("other"))
+    submit(entered / "single/results/other.json", leaderboard=entered / "board")
+    names = [(b["dataset"]["name"], [r["method"] for r in b["rows"]]) for b in board(entered)["boards"]]
     assert sorted(names) == [("pattern-0+pattern-1", ["tfp+4dgs"]), ("pattern-1", ["other"])]
 
 
@@ -193,28 +192,27 @@ def test_methods_are_on_the_tracks_that_withhold_nothing_they_are_given(
     assert f"rank 1 of 1 on unposed (release 2, revision {revision})" in out
 
 
-def test_the_boards_are_made_from_the_entries_alone(done: Path) -> None:
-    enter(done)
-    enter(done, "rough")
-    before = (done / "board/local.json").read_bytes()
-    (done / "board/local.json").unlink()
-    write_boards(done / "board")
-    assert (done / "board/local.json").read_bytes() == before
-    shutil.rmtree(done / "board/local")
-    write_boards(done / "board")
-    assert not (done / "board/local.json").exists()
+def test_the_boards_are_made_from_the_entries_alone(entered: Path) -> None:
+    enter(entered, "rough")
+    before = (entered / "board/local.json").read_bytes()
+    (entered / "board/local.json").unlink()
+    write_boards(entered / "board")
+    assert (entered / "board/local.json").read_bytes() == before
+    shutil.rmtree(entered / "board/local")
+    write_boards(entered / "board")
+    assert not (entered / "board/local.json").exists()
 
 
-def test_the_archive_is_kept_and_has_no_ranks(done: Path) -> None:
-    path = enter(done)
-    archive = done / "board/archive" / path.parent.name
+def test_the_archive_is_kept_and_has_no_ranks(entered: Path) -> None:
+    path = entry_of(entered)
+    archive = entered / "board/archive" / path.parent.name
     archive.parent.mkdir()
     path.parent.rename(archive)
     name = f"archive/{path.parent.name}/{path.name}"
-    (done / "board/LEDGER").write_text((done / "board/LEDGER").read_text().replace("local/", "archive/"))
-    write_boards(done / "board")
-    (only,) = board(done, "archive")["boards"]
-    assert only["why"].startswith("of an earlier release") and not (done / "board/local.json").exists()
+    (entered / "board/LEDGER").write_text((entered / "board/LEDGER").read_text().replace("local/", "archive/"))
+    write_boards(entered / "board")
+    (only,) = board(entered, "archive")["boards"]
+    assert only["why"].startswith("of an earlier release") and not (entered / "board/local.json").exists()
     assert [(r["rank"], r["entries"]) for r in only["rows"]] == [(None, [name])]
 
 

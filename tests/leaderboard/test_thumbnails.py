@@ -14,7 +14,7 @@ import pytest
 from changes import edit_json, files_in
 from dummy_methods import CountMethod, run
 from PIL import Image
-from submissions import edit_with_ledger, enter, read, submit
+from submissions import edit_with_ledger, enter, entry_of, read, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.error_map import SCALES
@@ -66,15 +66,15 @@ def test_equal_inputs_give_equal_bytes(done: Path) -> None:
     assert sheet_path(enter(done)).read_bytes() == first
 
 
-def test_large_images_are_made_small_with_their_crops(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = read(enter(done))["thumbnails"]["scenes"]["pattern-0"]
-    (done / "board").rename(done / "earlier")
+def test_large_images_are_made_small_with_their_crops(entered: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = read(entry_of(entered))["thumbnails"]["scenes"]["pattern-0"]
+    (entered / "board").rename(entered / "earlier")
     monkeypatch.setattr(thumbnails, "LARGEST", 10)
-    path = enter(done)
+    path = enter(entered)
     own = read(path)["thumbnails"]["scenes"]["pattern-0"]
     assert (own["width"], own["height"]) == (10, 6) and own["scale"] == whole["scale"]
     np.testing.assert_allclose(own["crop"], np.array(whole["crop"]) / 4, atol=1)
-    truth = encode_srgb(read_exr(done / f"s0/images/{MIDDLE}.exr")).astype(float)
+    truth = encode_srgb(read_exr(entered / f"s0/images/{MIDDLE}.exr")).astype(float)
     means = truth.reshape(6, 4, 10, 4).mean(axis=(1, 3))
     assert np.abs(pixels(sheet_path(path))[:6, :10] - means).mean() < 6
 
@@ -86,57 +86,57 @@ def test_a_claim_has_no_sheet(done: Path) -> None:
     assert read(path)["thumbnails"]["sha256"] == hashlib.sha256(sheet_path(path).read_bytes()).hexdigest()
 
 
-def test_a_claim_that_states_a_sheet_is_refused(done: Path) -> None:
-    stated = read(enter(done))["thumbnails"]
-    path = enter(done, "rough", verified=False)
+def test_a_claim_that_states_a_sheet_is_refused(entered: Path) -> None:
+    stated = read(entry_of(entered))["thumbnails"]
+    path = enter(entered, "rough", verified=False)
     edit_with_ledger(path, lambda e: e.update(thumbnails=stated))
     with pytest.raises(UserError, match="at verification/label"):
         read(path)
 
 
-def test_another_record_has_another_sheet_or_none(done: Path) -> None:
-    path = enter(done)
+def test_another_record_has_another_sheet_or_none(entered: Path) -> None:
+    path = entry_of(entered)
     first = sheet_path(path).read_bytes()
-    run(done / "out", [done / "s0", done / "s1"], CountMethod("tfp+4dgs", steps=1))
-    enter(done, replace=True)
+    run(entered / "out", [entered / "s0", entered / "s1"], CountMethod("tfp+4dgs", steps=1))
+    enter(entered, replace=True)
     second = sheet_path(path).read_bytes()
     assert second != first and read_sheet(sheet_path(path), read(path)["thumbnails"]) == second
-    run(done / "out", [done / "s0", done / "s1"], CountMethod("tfp+4dgs", steps=2))
-    enter(done, verified=False, replace=True)
+    run(entered / "out", [entered / "s0", entered / "s1"], CountMethod("tfp+4dgs", steps=2))
+    enter(entered, verified=False, replace=True)
     assert not sheet_path(path).exists()
 
 
 def test_the_sheet_of_a_removed_entry_is_found_and_the_next_submission_removes_it(
-    done: Path, capsys: pytest.CaptureFixture[str]
+    entered: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = enter(done)
-    enter(done, "rough")
-    assert problems(done, capsys) == []
+    path = entry_of(entered)
+    enter(entered, "rough")
+    assert problems(entered, capsys) == []
     path.unlink()
     assert f"error: {sheet_path(path)}: expected no such file, as no entry states it; remove it" in problems(
-        done, capsys
+        entered, capsys
     )
-    enter(done, "rough")
-    assert not sheet_path(path).exists() and problems(done, capsys) == []
+    enter(entered, "rough")
+    assert not sheet_path(path).exists() and problems(entered, capsys) == []
 
 
 def test_an_entry_without_its_sheet_gets_it_again_and_keeps_all_else(
-    done: Path, capsys: pytest.CaptureFixture[str]
+    entered: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without any, as entries were before sheets, and with one that is not there."""
-    path = enter(done)
-    before = files_in(done / "board")
+    path = entry_of(entered)
+    before, name = files_in(entered / "board"), path.relative_to(entered / "board").as_posix()
     sheet_path(path).unlink()
-    (line,) = problems(done, capsys)
+    (line,) = problems(entered, capsys)
     assert f"{sheet_path(path)}: expected the thumbnails that its entry states, found no such file" in line
-    enter(done, verified=False)
+    enter(entered, verified=False)
     assert not sheet_path(path).exists()
-    enter(done)
-    assert files_in(done / "board") == before
+    enter(entered)
+    assert files_in(entered / "board") == before
     sheet_path(path).unlink()
     edit_with_ledger(path, lambda e: e.pop("thumbnails"))
-    enter(done)
-    assert path.read_bytes() == before[path.relative_to(done / "board").as_posix()] and problems(done, capsys) == []
+    enter(entered)
+    assert files_in(entered / "board")[name] == before[name] and problems(entered, capsys) == []
 
 
 def test_a_killed_submission_leaves_a_sheet_that_blocks_nobody(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,10 +154,10 @@ def test_a_killed_submission_leaves_a_sheet_that_blocks_nobody(done: Path, monke
     assert read_sheet(sheet_path(path), read(path)["thumbnails"])
 
 
-def test_an_exchanged_sheet_is_found(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, other = enter(done), enter(done, "rough")
+def test_an_exchanged_sheet_is_found(entered: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, other = entry_of(entered), enter(entered, "rough")
     sheet_path(path).write_bytes(sheet_path(other).read_bytes())
-    (line,) = problems(done, capsys)
+    (line,) = problems(entered, capsys)
     assert line.startswith(
         f"error: {sheet_path(path)}: expected sha256 {read(path)['thumbnails']['sha256'][:16]}... as"
     )
@@ -179,24 +179,24 @@ def png() -> bytes:
     [(lossy(16383, 16383), "16383x16383"), (lossy(120, 49), "120x49"), (png(), "another file"), (b"", "another file")],
 )
 def test_an_image_of_another_size_or_kind_is_no_sheet_whatever_its_hash(
-    done: Path, content: bytes, found: str, capsys: pytest.CaptureFixture[str]
+    entered: Path, content: bytes, found: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = enter(done)
+    path = entry_of(entered)
     sheet_path(path).write_bytes(content)
     edit_with_ledger(path, lambda e: e["thumbnails"].update(sha256=hashlib.sha256(content).hexdigest()))
-    (line,) = [line for line in problems(done, capsys) if "leaderboard.json" not in line]
+    (line,) = [line for line in problems(entered, capsys) if "leaderboard.json" not in line]
     assert f"expected a lossy WebP image of 120x48 pixels, found {found};" in line
 
 
-def test_a_large_file_is_not_read(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = enter(done)
+def test_a_large_file_is_not_read(entered: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = entry_of(entered)
     monkeypatch.setattr(thumbnails, "MOST_BYTES", 100)
     with pytest.raises(UserError, match="100 bytes at most"):
         read_sheet(sheet_path(path), json.loads(path.read_text())["thumbnails"])
 
 
-def test_an_edit_of_what_the_sheet_shows_is_an_edit_of_the_entry(done: Path) -> None:
-    path = enter(done)
+def test_an_edit_of_what_the_sheet_shows_is_an_edit_of_the_entry(entered: Path) -> None:
+    path = entry_of(entered)
     edit_json(path, lambda e: e["thumbnails"]["scenes"]["pattern-0"].update(target="cam_03/000020"))
     with pytest.raises(UserError, match="expected an entry as LEDGER lists it"):
         read(path)
@@ -208,10 +208,10 @@ def forged(path: Path, sheet: bytes) -> None:
     edit_with_ledger(path, lambda e: e["thumbnails"].update(sha256=hashlib.sha256(sheet).hexdigest()))
 
 
-def test_a_sheet_that_shows_other_images_is_found_where_the_entry_is_scored_again(done: Path) -> None:
-    path = enter(done)
+def test_a_sheet_that_shows_other_images_is_found_where_the_entry_is_scored_again(entered: Path) -> None:
+    path = entry_of(entered)
     honest = sheet_path(path).read_bytes()
-    scenes, predictions = (done / "s0", done / "s1"), done / "out/predictions"
+    scenes, predictions = (entered / "s0", entered / "s1"), entered / "out/predictions"
     levels = np.asarray(Image.open(sheet_path(path)).convert("L"))
     other = levels.copy()
     other[30:40, 50:60] = 255 - other[30:40, 50:60]
@@ -222,9 +222,9 @@ def test_a_sheet_that_shows_other_images_is_found_where_the_entry_is_scored_agai
         return out.getvalue()
 
     def found() -> list[str]:
-        submit(done / "out/results/bad.json", leaderboard=done / "board")  # the boards are as the entries give them
-        assert not verify_leaderboard(done / "board").problems
-        return list(verify_leaderboard(done / "board", predictions, scenes).problems)
+        submit(entered / "out/results/bad.json", leaderboard=entered / "board")  # writes the boards anew
+        assert not verify_leaderboard(entered / "board").problems
+        return list(verify_leaderboard(entered / "board", predictions, scenes).problems)
 
     forged(path, encoded(levels, 40))
     assert found() == [], "another encoder"
@@ -234,9 +234,9 @@ def test_a_sheet_that_shows_other_images_is_found_where_the_entry_is_scored_agai
     forged(path, honest[:200] + b"\0" * (len(honest) - 200))
     (line,) = found()
     assert line.startswith(f"{sheet_path(path)}: expected")
-    enter(done)
+    enter(entered)
     assert sheet_path(path).read_bytes() != honest, "it is as its entry states"
-    enter(done, replace=True)
+    enter(entered, replace=True)
     assert sheet_path(path).read_bytes() == honest and found() == []
     edit_with_ledger(path, lambda e: e["thumbnails"]["scenes"]["pattern-0"].update(target="cam_03/000020"))
     (line,) = found()

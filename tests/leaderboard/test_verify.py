@@ -195,34 +195,36 @@ def test_what_submit_writes_has_no_problems(
         (lambda e: e["verification"].update(label="best"), "at verification/label"),
     ],
 )
-def test_every_edit_by_hand_is_named(done: Path, change: Any, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    path = enter(done)
+def test_every_edit_by_hand_is_named(
+    entered: Path, change: Any, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = entry_of(entered)
     edit_json(path, change)
-    lines = problems(done, capsys)
+    lines = problems(entered, capsys)
     assert any("tfp+4dgs.json" in line and message in line for line in lines)
     assert any("local.json: expected what the entries give" in line for line in lines), "its row is gone"
 
 
-def test_boards_follow_from_the_entries(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = enter(done)
-    edit_json(done / "board/local.json", lambda b: b["boards"][0]["rows"][0].update(rank=None))
-    (line,) = problems(done, capsys)
+def test_boards_follow_from_the_entries(entered: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = entry_of(entered)
+    edit_json(entered / "board/local.json", lambda b: b["boards"][0]["rows"][0].update(rank=None))
+    (line,) = problems(entered, capsys)
     assert "local.json: expected what the entries give" in line
-    enter(done)
+    enter(entered)
     moved = path.with_name("other.json")
     path.rename(moved)
-    assert any("other.json: expected the entry of" in line for line in problems(done, capsys))
+    assert any("other.json: expected the entry of" in line for line in problems(entered, capsys))
 
 
 def test_a_forgery_that_agrees_with_itself_is_found_with_the_files(
-    done: Path, capsys: pytest.CaptureFixture[str]
+    entered: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An entry edited together with its ledger line and its board: only scoring again finds it."""
-    path = enter(done)
+    path = entry_of(entered)
     edit_with_ledger(path, lambda entry: raise_metric(entry["record"], "psnr", 1))
-    enter(done, "rough")  # writes the boards anew
-    assert not problems(done, capsys)
-    (line,) = problems(done, capsys, **files(done))
+    enter(entered, "bad", verified=False)  # writes the boards anew, and costs no scores
+    assert not problems(entered, capsys)
+    (line,) = problems(entered, capsys, **files(entered))
     assert "tfp+4dgs.json, scene pattern-0" in line and "as computed from the files" in line
 
 
@@ -247,13 +249,13 @@ def edit_truth(**changes: Any) -> Any:
     ],
 )
 def test_an_edited_verification_is_found_with_the_files(
-    done: Path, capsys: pytest.CaptureFixture[str], change: Any, message: str
+    entered: Path, capsys: pytest.CaptureFixture[str], change: Any, message: str
 ) -> None:
     """Truth check or label edited together with the ledger: what was recomputed is compared."""
-    edit_with_ledger(enter(done), change)
-    enter(done, "rough")  # writes the boards anew
-    assert not problems(done, capsys)
-    lines = problems(done, capsys, **files(done))
+    edit_with_ledger(entry_of(entered), change)
+    enter(entered, "bad", verified=False)  # writes the boards anew, and costs no scores
+    assert not problems(entered, capsys)
+    lines = problems(entered, capsys, **files(entered))
     assert len(lines) == 1 and "tfp+4dgs.json" in lines[0] and re.search(message, lines[0]), lines
 
 
@@ -261,17 +263,17 @@ REFIT = {"psnr": {"pattern-0": 20.0}, "tolerance_db": 0.3, "bit_equal": False, "
 SCENES = ("pattern-0", "pattern-1")
 
 
-def test_flags_that_an_edit_hid_are_found(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A noise share that was edited, or removed as if nobody had measured it."""
-    edit_with_ledger(enter(done), edit_truth(noise_share=0.0, noise_share_error=0.01, ceiling_db=60.0))
-    enter(done, "rough")
+    edit_with_ledger(entry_of(entered), edit_truth(noise_share=0.0, noise_share_error=0.01, ceiling_db=60.0))
+    enter(entered, "rough")
 
     def check(share: float) -> tuple[str, ...]:
         def measured(*args: Any) -> TruthCheck:
             return replace(check_truth(*args), noise_share=share, noise_share_error=0.01, ceiling_db=60.0)
 
         monkeypatch.setattr(verify, "check_truth", measured)
-        return verify.verify_leaderboard(done / "board", **files(done)).problems
+        return verify.verify_leaderboard(entered / "board", **files(entered)).problems
 
     assert not check(0.001)
     assert len(check(0.5)) == 2 and "expected noise_share 0.5, as computed again, found 0.0" in check(0.5)[1]
@@ -279,16 +281,15 @@ def test_flags_that_an_edit_hid_are_found(done: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_label_that_a_second_fit_does_not_bear_out_is_found(
-    done: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
+    entered: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    enter(done)
-    enter(done, refit=True)
+    enter(entered, refit=True)
     capsys.readouterr()
-    assert verify_leaderboard(done / "board", **files(done)) == 0
+    assert verify_leaderboard(entered / "board", **files(entered)) == 0
     assert "1 scored again, 1 labelled re-fitted and not fitted again (--refit), no problems" in capsys.readouterr().out
-    assert verify_leaderboard(done / "board", **files(done), refit=True) == 0
+    assert verify_leaderboard(entered / "board", **files(entered), refit=True) == 0
     installed["tfp+4dgs"] = Darker("tfp+4dgs")
-    (line,) = problems(done, capsys, **files(done), refit=True)
+    (line,) = problems(entered, capsys, **files(entered), refit=True)
     assert "expected a second fit within 0.3 dB of the claimed" in line
 
 
@@ -302,7 +303,7 @@ def test_the_second_fit_of_a_method_that_opens_the_held_out_stream_fails(
     edit_with_ledger(
         enter(done, "plays-back"), lambda entry: entry["verification"].update(label="re-fitted", refit=refit)
     )
-    enter(done, "rough")  # writes the boards anew
+    enter(done, "bad", verified=False)  # writes the boards anew
     assert not problems(done, capsys, **files(done)), "its images are as claimed"
     (line,) = problems(done, capsys, **files(done), refit=True)
     assert "plays-back on pattern-0: expected a second fit that ends, found ValueError" in line

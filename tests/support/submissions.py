@@ -29,7 +29,7 @@ def enter(done: Path, name: str = "tfp+4dgs", verified: bool = True, **options: 
     return entry_of(done, name)
 
 
-def entry_of(done: Path, name: str) -> Path:
+def entry_of(done: Path, name: str = "tfp+4dgs") -> Path:
     (path,) = (p for folder in ("entries", "local") for p in (done / "board" / folder).glob(f"*/{name}.json"))
     return path
 
