@@ -56,11 +56,18 @@ def swept(
 
 
 @pytest.fixture
+def fits_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits in this process: to start one for each takes longer than the fit."""
+    monkeypatch.setattr("spike4dgs.studies.results.sweep.Apart", lambda: None)
+
+
+@pytest.fixture
 def folder(tmp_path: Path) -> Path:
     write_small_scene(tmp_path / "pattern-0")
     return tmp_path
 
 
+@pytest.mark.usefixtures("fits_here")
 def test_one_scene_in_two_splits_has_the_scores_of_each_alone(tmp_path: Path) -> None:
     splits, psnr = ("corner", "center"), {}
     for name, chosen in {"both": splits, **{split: (split,) for split in splits}}.items():
@@ -155,6 +162,7 @@ def test_two_sweeps_do_not_use_one_folder(name: str, folder: Path) -> None:
         swept(folder, cells("a"), {"a": CountMethod("a")})
 
 
+@pytest.mark.usefixtures("fits_here")
 def test_a_quiet_pass_fits_again_what_was_measured_beside_others(folder: Path) -> None:
     (planned,), methods = cells("counts"), {"counts": CountMethod("counts")}
     _, busy, _ = swept(folder, [planned], methods)
@@ -167,6 +175,7 @@ def test_a_quiet_pass_fits_again_what_was_measured_beside_others(folder: Path) -
         swept(folder, [planned], methods, quiet=True, workers=2)
 
 
+@pytest.mark.usefixtures("fits_here")
 def test_a_limit_of_time_begins_no_further_cell_and_scenes_may_be_missing(folder: Path) -> None:
     planned = cells("a", "b", scenes=("pattern-0", "pattern-1"))
     methods = {"a": CountMethod("a"), "b": CountMethod("b")}
@@ -177,6 +186,7 @@ def test_a_limit_of_time_begins_no_further_cell_and_scenes_may_be_missing(folder
         swept(folder, cells("a", scenes=("pattern-7",)), methods)
 
 
+@pytest.mark.usefixtures("fits_here")
 def test_records_of_other_code_are_kept_and_named_and_those_of_another_scene_refused(folder: Path) -> None:
     (planned,), methods = cells("a"), {"a": CountMethod("a"), "b": CountMethod("b")}
     _, records, _ = swept(folder, [planned], methods)
@@ -187,6 +197,7 @@ def test_records_of_other_code_are_kept_and_named_and_those_of_another_scene_ref
         swept(folder, cells("b"), methods)
 
 
+@pytest.mark.usefixtures("fits_here")
 def test_a_scene_of_another_processor_joins_the_records_where_it_differs_by_rounding(folder: Path) -> None:
     methods = {"a": CountMethod("a"), "b": CountMethod("b")}
     _, records, _ = swept(folder, cells("a"), methods)
@@ -204,6 +215,7 @@ def test_a_scene_of_another_processor_joins_the_records_where_it_differs_by_roun
         swept(folder, cells("b"), methods)
 
 
+@pytest.mark.usefixtures("fits_here")
 def test_a_released_scene_is_known_by_the_releases_fingerprint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     methods = {"a": CountMethod("a")}
     swept(folder, cells("a"), methods)
