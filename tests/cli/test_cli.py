@@ -199,11 +199,6 @@ def test_verify_names_every_damaged_file(small_scene: Path, capsys: pytest.Captu
         assert sum(name in line for line in errors) == 1
 
 
-def test_python_m_runs_the_command_line() -> None:
-    done = python("-m", "spike4dgs.cli", "verify", "nowhere")
-    assert done.returncode == 2 and done.stderr.startswith("error: nowhere: expected a scene folder")
-
-
 @pytest.mark.parametrize(
     ("value", "good"), [("x", False), ("0", False), ("-1", False), ("", False), ("2", True), ("4, 2", True)]
 )
