@@ -13,11 +13,20 @@ from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import Sim3
-from spike4dgs.benchmark.scene.training_bursts import open_bursts
+from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.studies.poses import dark
 from spike4dgs.studies.poses.dark import ESTIMATORS, dark_poses, errors_of, see
 
 TRUE = ToyWorld(width=96, height=61, seed=1).training.cameras
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hidden shard, and one to train on."""
+    folder = tmp_path_factory.mktemp("shards")
+    write_toy_shard(folder, 12, width=96, height=61, resting=2)
+    write_toy_shard(folder, 13, resting=1)
+    return folder
 
 
 def turned(degrees: float) -> np.ndarray:
@@ -45,41 +54,40 @@ def test_a_turned_camera_and_an_absent_one_count_in_their_pairs_alone() -> None:
     assert all((error == 180).all() for error in errors_of(together, TRUE))
 
 
-def test_estimators_see_the_light_that_there_is_without_the_pixels_pattern(tmp_path: Path) -> None:
-    file = open_bursts(write_toy_shard(tmp_path, 12, width=96, height=61, resting=1))
+def test_estimators_see_the_light_that_there_is_without_the_pixels_pattern(shards: Path) -> None:
+    (file,) = (f for f in open_folder(shards) if f.facts.hidden)
     burst, rng = file.read(2), np.random.default_rng(0)
     still = burst.keys[0, :8]
-    for light in (1.0, 0.25):
+    for light in (0.25, 1.0):
         sight = see(burst, file, light, 401, rng)
         assert len(sight.cameras) == 8 and sight.inputs.shape == (8, 4, 61, 96)
         expected = still * file.facts.radiance_gain * light
         assert np.sqrt(np.mean((sight.means - expected) ** 2)) < 0.004 + 0.02 * light
         assert np.median(np.abs(sight.intervals / expected - 1)) < 0.2
-    rotation, direction = errors_of(ESTIMATORS["matching network"](see(burst, file, 1.0, 401, rng), 0), sight.cameras)
+    rotation, direction = errors_of(ESTIMATORS["matching network"](sight, 0), sight.cameras)
     assert rotation.max() < 1 and direction.max() < 5
 
 
 def test_the_table_has_shares_of_pairs_in_each_condition(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for variant in (12, 13):  # one hidden, one to train on
-        write_toy_shard(tmp_path, variant, width=96, height=61, resting=2)
     monkeypatch.setattr(dark, "LIGHTS", (1.0, 1 / 4096))
     monkeypatch.setattr(dark, "TICKS", (41,))
-    assert dark_poses(tmp_path, bursts=1, out=tmp_path / "out") == 0
-    rows = json.loads((tmp_path / "out" / "poses.json").read_text())["rows"]
+    monkeypatch.setattr(dark, "VIEWS", 6)  # 15 pairs instead of 28
+    assert dark_poses(shards, bursts=1, out=tmp_path / "out") == 0
+    rows = json.loads((tmp_path / "out/poses.json").read_text())["rows"]
     assert [row["world"] for row in rows] == ["toy-12"] * 2 * len(ESTIMATORS)
-    assert all(len(row["rotation_deg"]) == len(row["direction_deg"]) == 28 for row in rows)
-    _, _, bright, black = (tmp_path / "out" / "poses.md").read_text().splitlines()
+    assert all(len(row["rotation_deg"]) == len(row["direction_deg"]) == 15 for row in rows)
+    _, _, bright, black = (tmp_path / "out/poses.md").read_text().splitlines()
     assert bright == "| 1 | 2 |" + " 100 % / 100 % |" * len(ESTIMATORS)  # within 1 and 5 degrees
     assert black == "| 1/4096 | 2 |" + " 0 % / 0 % |" * len(ESTIMATORS)
-    assert (tmp_path / "out" / "poses.png").stat().st_size > 1000
+    assert (tmp_path / "out/poses.png").stat().st_size > 1000
     assert "1/1 arrays" in capsys.readouterr().out
     monkeypatch.setattr(dark, "see", None)  # an array that is done is not measured again
-    assert dark_poses(tmp_path, bursts=1, out=tmp_path / "out") == 0
-    assert json.loads((tmp_path / "out" / "poses.json").read_text())["rows"] == rows
+    assert dark_poses(shards, bursts=1, out=tmp_path / "out") == 0
+    assert json.loads((tmp_path / "out/poses.json").read_text())["rows"] == rows
     with pytest.raises(TypeError):  # with another seed it is
-        dark_poses(tmp_path, bursts=1, seed=1, out=tmp_path / "out")
+        dark_poses(shards, bursts=1, seed=1, out=tmp_path / "out")
 
 
 def test_a_folder_without_hidden_arrays_at_rest_is_refused(tmp_path: Path) -> None:
