@@ -281,15 +281,16 @@ def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.Mon
 
 
 def test_a_label_that_a_second_fit_does_not_bear_out_is_found(
-    entered: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
+    done: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    enter(entered, refit=True)
+    enter(done)
+    enter(done, refit=True)
     capsys.readouterr()
-    assert verify_leaderboard(entered / "board", **files(entered)) == 0
+    assert verify_leaderboard(done / "board", **files(done)) == 0
     assert "1 scored again, 1 labelled re-fitted and not fitted again (--refit), no problems" in capsys.readouterr().out
-    assert verify_leaderboard(entered / "board", **files(entered), refit=True) == 0
+    assert verify_leaderboard(done / "board", **files(done), refit=True) == 0
     installed["tfp+4dgs"] = Darker("tfp+4dgs")
-    (line,) = problems(entered, capsys, **files(entered), refit=True)
+    (line,) = problems(done, capsys, **files(done), refit=True)
     assert "expected a second fit within 0.3 dB of the claimed" in line
 
 
