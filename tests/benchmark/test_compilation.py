@@ -16,29 +16,34 @@ import spike4dgs.benchmark
 from spike4dgs.benchmark.compilation import cached_njit
 from spike4dgs.benchmark.files import user_cache
 
-COUNT = """
-import numpy as np
-from spike4dgs.benchmark.spikes import bits
-from spike4dgs.benchmark.spikes.stream import pack
-assert bits.__file__.startswith(FOLDER), bits.__file__
-spikes = np.ones((3, 4, 8), np.uint8)
-assert (bits.unpack(pack(spikes), 8, 4, True) == 1).all()
+TWICE = """
+from spike4dgs.benchmark.compilation import cached_njit
+
+@cached_njit(nogil=True)
+def twice(x):
+    return 2 * x
+"""
+CALL = """
+from spike4dgs.benchmark import twice
+assert twice.__file__.startswith(FOLDER), twice.__file__
+assert twice.twice(4) == 8
 """
 
 
 @pytest.fixture
 def install(tmp_path: Path) -> Path:
-    """A copy of the package with the room `benchmark` alone, without compiled files, as an install of its own."""
-    source = Path(spike4dgs.benchmark.__file__).parent
-    shutil.copytree(source, tmp_path / "first/spike4dgs/benchmark", ignore=shutil.ignore_patterns("__pycache__"))
+    """A copy of the package with a kernel in the room `benchmark` alone, as an install of its own."""
+    source, room = Path(spike4dgs.benchmark.__file__).parent, tmp_path / "first/spike4dgs/benchmark"
+    shutil.copytree(source, room, ignore=shutil.ignore_patterns("__pycache__"))
+    (room / "twice.py").write_text(TWICE)
     shutil.copy(str(spike4dgs.__file__), tmp_path / "first/spike4dgs/__init__.py")
     return tmp_path / "first"
 
 
-def unpack_in(install: Path, **variables: str) -> None:
+def call_in(install: Path, **variables: str) -> None:
     """Call a kernel of an install in a process of its own."""
     kept = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
-    code = COUNT.replace("FOLDER", repr(str(install)))
+    code = CALL.replace("FOLDER", repr(str(install)))
     command = [sys.executable, "-P", "-c", code]
     done = subprocess.run(command, env=kept | {"PYTHONPATH": str(install)} | variables, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -51,16 +56,16 @@ def compiled(folder: Path) -> list[Path]:
 def test_nothing_lands_beside_the_sources_and_two_installs_share_nothing(install: Path, tmp_path: Path) -> None:
     second = shutil.copytree(install, tmp_path / "second")
     cache = tmp_path / "cache"
-    unpack_in(install, XDG_CACHE_HOME=str(cache))
+    call_in(install, XDG_CACHE_HOME=str(cache))
     first = compiled(cache / "spike4dgs/numba")
-    unpack_in(second, XDG_CACHE_HOME=str(cache))
+    call_in(second, XDG_CACHE_HOME=str(cache))
     both = compiled(cache / "spike4dgs/numba")
     assert first and len(both) == 2 * len(first)
     assert not compiled(install) and not compiled(second)
 
 
 def test_numbas_variable_goes_before(install: Path, tmp_path: Path) -> None:
-    unpack_in(install, XDG_CACHE_HOME=str(tmp_path / "cache"), NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
+    call_in(install, XDG_CACHE_HOME=str(tmp_path / "cache"), NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
     assert compiled(tmp_path / "chosen") and not (tmp_path / "cache/spike4dgs/numba").exists()
     assert not compiled(install)
 
@@ -105,7 +110,7 @@ def test_a_kernel_is_compiled_anew_where_another_file_changes_what_is_in_it(
 
 def test_without_a_folder_to_write_to_nothing_is_kept(install: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    unpack_in(install, XDG_CACHE_HOME=str(tmp_path / "file"))
+    call_in(install, XDG_CACHE_HOME=str(tmp_path / "file"))
     assert not compiled(tmp_path)
 
 

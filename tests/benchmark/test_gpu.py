@@ -3,56 +3,50 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.benchmark import environment
+from spike4dgs.baselines.recipes import PARTS
+from spike4dgs.benchmark import environment, plugins
 from spike4dgs.benchmark.environment import Missing, choose_device, missing_rasterizer
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Recipe, find_methods
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
-
-# A PyTorch that claims a GPU, in an environment that has no numba-cuda.
-_CLAIM = """
-import importlib.util, sys, torch
-torch.cuda.is_available, torch.cuda.device_count = lambda: True, lambda: 1
-found = importlib.util.find_spec
-importlib.util.find_spec = lambda name, *a: None if name == "numba_cuda" else found(name, *a)
-"""
-_RUN = """
-from types import SimpleNamespace
-from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.benchmark import plugins
-from spike4dgs.cli import main
-from spike4dgs.benchmark.method import Recipe, find_methods
-from spike4dgs.benchmark.reports import benchmark
 from spike4dgs.method.fit import RecipeMethod
-benchmark._write_images = lambda *_: []  # they take longer than the fits
-steps = {"trainer.coarse_steps": 4, "trainer.fine_steps": 4, "images.time_spacing_ticks": 20}
-tiny = RecipeMethod(Recipe("tiny", "msdi", "rig", "static", "pixel", steps), PARTS)
-methods = {"tiny": tiny, "nearest-view": find_methods()["nearest-view"]}
-entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
-plugins.entry_points = lambda group: [entry]
-sys.exit(main(sys.argv[1:]))
-"""
 
 
-def test_a_gpu_without_kernels_means_the_cpu_and_one_line(small_scene: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def claims(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A PyTorch that claims a GPU, in an environment that has no numba-cuda."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    found = environment.find_spec
+    monkeypatch.setattr(environment, "find_spec", lambda name: None if name == "numba_cuda" else found(name))
+    environment._say_once.cache_clear()
+
+
+@pytest.mark.usefixtures("claims", "no_images")
+def test_a_gpu_without_kernels_means_the_cpu_and_one_line(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
-    methods = ("nearest-view", "tiny")
+    steps = {"trainer.coarse_steps": 4, "trainer.fine_steps": 4, "images.time_spacing_ticks": 20}
+    tiny = RecipeMethod(Recipe("tiny", "msdi", "rig", "static", "pixel", steps), PARTS)
+    methods = {"tiny": tiny, "nearest-view": find_methods()["nearest-view"]}
+    entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: methods)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
     command = ["run-benchmark", str(small_scene), "--methods", *methods, "--metrics", "psnr", "--in-process"]
-    command = [sys.executable, "-c", _CLAIM + _RUN, *command, "--out", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("compiling")]  # whoever comes first
-    assert len(lines) == 1, done.stderr
+    assert main([*command, "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    lines = [line for line in said.splitlines() if not line.startswith("compiling")]  # whoever comes first
+    assert len(lines) == 1, said
     line = lines[0]
     assert line.startswith("spike4dgs: computing on the CPU: PyTorch sees a CUDA device, but rendering on it needs")
     assert "pip install 'spike4dgs[cuda]'" in line and "--device cpu" in line
@@ -61,16 +55,6 @@ def test_a_gpu_without_kernels_means_the_cpu_and_one_line(small_scene: Path, tmp
         assert cell["status"] == "ok" and cell["error"] is None
         prediction = json.loads((out / f"predictions/{name}/pattern-0/prediction.json").read_text())
         assert prediction["device"] == "cpu"
-
-
-@pytest.fixture
-def claims(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same claim in this process."""
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    found = environment.find_spec
-    monkeypatch.setattr(environment, "find_spec", lambda name: None if name == "numba_cuda" else found(name))
-    environment._say_once.cache_clear()
 
 
 @pytest.mark.usefixtures("claims")

@@ -17,21 +17,25 @@ from spike4dgs.benchmark.metrics.neural_trunks import ResNet18
 from spike4dgs.benchmark.weights import METAIQA, VARIABLE, load_into
 
 State = dict[str, torch.Tensor]
+Weighed = tuple[torch.nn.Module, State]
 
 
 def make_image(seed: int = 0, height: int = 60, width: int = 90) -> NDArray[np.uint8]:
     return np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
 
 
-def random_state(seed: int = 0) -> State:
-    torch.manual_seed(seed)
-    state = metaiqa_network().state_dict()
+@pytest.fixture(scope="module")
+def weighed() -> Weighed:
+    """The network with random weights, and these."""
+    torch.manual_seed(1)
+    network = metaiqa_network()
+    state = network.state_dict()
     for name, tensor in state.items():
         if name.endswith("running_mean"):
             tensor.normal_(0, 0.1)
         elif name.endswith("running_var"):
             tensor.uniform_(0.5, 1.5)
-    return state
+    return load_into(network, {name: tensor.clone() for name, tensor in state.items()}, "x"), state
 
 
 def test_resnet_equals_torchvisions() -> None:
@@ -72,26 +76,25 @@ def plain_score(state: State, image: NDArray[np.uint8]) -> float:
     return float(torch.sigmoid(F.linear(x, s["net.fc3.weight"], s["net.fc3.bias"])))
 
 
-@pytest.mark.parametrize("seed", [1])
-def test_equals_the_network_written_out_in_float64(seed: int) -> None:
-    state, image = random_state(seed), make_image(seed)
-    network = load_into(metaiqa_network(), state, "x")
+def test_equals_the_network_written_out_in_float64(weighed: Weighed) -> None:
+    network, state = weighed
+    image = make_image(1)
     assert predict(network, image) == pytest.approx(plain_score(state, image), abs=1e-4)
 
 
-def test_the_head_has_the_published_size() -> None:
+def test_the_head_has_the_published_size(weighed: Weighed) -> None:
     head = 1000 * 1024 + 1024 + 2 * 1024 + 1 + 1024 * 512 + 512 + 2 * 512 + 1 + 512 + 1
-    assert sum(p.numel() for name, p in metaiqa_network().named_parameters() if name.startswith("net.")) == head
+    assert sum(p.numel() for name, p in weighed[0].named_parameters() if name.startswith("net.")) == head
 
 
 def test_weights_come_from_the_users_file_and_are_named_by_their_hash(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    weighed: Weighed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    state = random_state()
+    network, state = weighed
     path = tmp_path / METAIQA.name
     torch.save(state, path)
     monkeypatch.setenv(VARIABLE, str(path))
-    assert metaiqa(make_image()) == predict(load_into(metaiqa_network(), state, "x"), make_image())
+    assert metaiqa(make_image()) == predict(network, make_image())
     assert select_metrics(("metaiqa",)).weights["metaiqa"] == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -103,6 +106,6 @@ def test_weights_come_from_the_users_file_and_are_named_by_their_hash(
         (make_image()[..., None], r"found uint8 \(60, 90, 1\)"),
     ],
 )
-def test_other_images_are_refused(image: NDArray, message: str) -> None:
+def test_other_images_are_refused(weighed: Weighed, image: NDArray, message: str) -> None:
     with pytest.raises(UserError, match=message):
-        predict(metaiqa_network().eval(), image)
+        predict(weighed[0], image)
