@@ -18,7 +18,7 @@ import nosy_methods
 import pytest
 from changes import edit_json, files_in
 from dummy_methods import CountMethod, FailingMethod, WorkerKiller, prediction_bytes, run, wait_for, without_timings
-from nosy_methods import LacksWeights, Lies, LooksAround, PlaysBack, Refines, Swaps
+from nosy_methods import LacksWeights, LooksAround, PlaysBack, Refines, Swaps
 from rich.console import Console
 from small_scenes import write_small_scene
 
@@ -49,33 +49,35 @@ def cell_of(records: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def test_the_bits_are_those_of_a_fit_in_this_process(small_scene: Path, tmp_path: Path) -> None:
-    methods = (CountMethod(), get_method("tfp+static"))
-    here = run(tmp_path / "here", [small_scene], *methods, seed=3, budget=Budget(0.01), **PSNR)
-    apart = run(tmp_path / "apart", [small_scene], *methods, seed=3, budget=Budget(0.01), **APART)
-    assert [cell["status"] for r in apart for cell in r["scenes"].values()] == ["ok", "ok"]
+    method = get_method("tfp+static")
+    here = run(tmp_path / "here", [small_scene], method, seed=3, budget=Budget(0.01), **PSNR)
+    apart = run(tmp_path / "apart", [small_scene], method, seed=3, budget=Budget(0.01), **APART)
+    assert cell_of(apart)["status"] == "ok"
     assert prediction_bytes(tmp_path / "apart") == prediction_bytes(tmp_path / "here")
     assert [without_timings(r) for r in apart] == [without_timings(r) for r in here]
-    models = [tmp_path / mode / "models/tfp+static/pattern-0.safetensors" for mode in ("here", "apart")]
-    assert all(path.is_file() for path in models)
+    assert all((tmp_path / mode / "models/tfp+static/pattern-0.safetensors").is_file() for mode in ("here", "apart"))
     info, other = (
-        json.loads((tmp_path / mode / "predictions/counts/pattern-0/prediction.json").read_text())
+        json.loads((tmp_path / mode / "predictions/tfp+static/pattern-0/prediction.json").read_text())
         for mode in ("here", "apart")
     )
-    assert {k: v for k, v in info.items() if k in ("key", "scene_revision", "split", "scene", "method", "budget")} == {
-        k: v for k, v in other.items() if k in ("key", "scene_revision", "split", "scene", "method", "budget")
-    }
+    for key in ("key", "scene_revision", "split", "scene", "method", "budget"):
+        assert info[key] == other[key], key
     assert other["fit_seconds"] > 0 and other["render_fps"] > 0 and other["peak_memory_mb"] > 10
-    again = CountMethod()
-    run(tmp_path / "here", [small_scene], again, seed=3, budget=Budget(0.01), **APART)
-    assert again.fits == 0, "what a fit in this process made is kept"
 
 
 def test_the_held_out_stream_is_not_next_to_the_others(small_scene: Path, tmp_path: Path) -> None:
-    cell = cell_of(run(tmp_path / "here", [small_scene], PlaysBack(), **PSNR))
+    """Where workers fit apart too."""
+    methods = PlaysBack(), CountMethod()
+    found, counts = run(tmp_path / "here", [small_scene], *methods, **PSNR)
+    cell = cell_of([found])
     assert cell["status"] == "ok" and cell["metrics"]["psnr"] > 25, "a method that looks for it in the scene finds it"
-    cell = cell_of(run(tmp_path / "apart", [small_scene], PlaysBack(), **APART))
+    lost, other = run(tmp_path / "apart", [small_scene], *methods, workers=2, **APART)
+    cell = cell_of([lost])
     assert cell["status"] == "failed" and "not enough values to unpack" in cell["error"]
     assert not (tmp_path / "apart/predictions/plays-back/pattern-0").exists()
+    assert without_timings(other) == without_timings(counts)
+    same = "predictions/counts"
+    assert prediction_bytes(tmp_path / "apart" / same) == prediction_bytes(tmp_path / "here" / same)
 
 
 def test_what_a_fit_sees_has_neither_the_held_out_camera_nor_how_the_scene_was_made(
@@ -128,52 +130,53 @@ def test_other_splits_hold_out_their_own_cameras(split: str, tmp_path: Path) -> 
 
 def test_refined_views_are_sent_after_the_images_are_taken(small_scene: Path, tmp_path: Path) -> None:
     method = Refines(tmp_path / "seen.json")
-    plain, refined = run(tmp_path / "out", [small_scene], method, **APART)
+    plain, refined = run(tmp_path / "out", [small_scene], method, seed=3, **APART)
     seen = json.loads((tmp_path / "seen.json").read_text())
     assert seen["before"] == 3 and seen["image"] > 0 and 0 < seen["background"] < 40 * 24
     assert [plain["method"]["name"], refined["method"]["name"]] == ["refines", "refines.refined"]
-    here = run(tmp_path / "here", [small_scene], Refines(tmp_path / "here.json"), **PSNR)
+    here = run(tmp_path / "here", [small_scene], Refines(tmp_path / "here.json"), seed=3, **PSNR)
     assert [r["mean"] for r in here] == [plain["mean"], refined["mean"]] and plain["mean"] != refined["mean"]
     assert prediction_bytes(tmp_path / "out") == prediction_bytes(tmp_path / "here")
     assert json.loads((tmp_path / "here.json").read_text()) == seen
     model = json.loads((tmp_path / "out/models/refines/pattern-0.safetensors").read_text())
     assert model == {"scene": "pattern-0", "revision": open_scene(small_scene).revision}
+    again = Refines(tmp_path / "again.json")
+    run(tmp_path / "here", [small_scene], again, seed=3, **APART)
+    assert again.fits == 0, "what a fit in this process made is kept"
 
 
 def test_failures_come_back_as_from_this_process(small_scene: Path, tmp_path: Path) -> None:
     user = UserError("here: expected light, found none; add some")
     methods = [FailingMethod("value", ValueError("no luck")), FailingMethod("user", user), LacksWeights("weights")]
     here = run(tmp_path / "here", [small_scene], *methods, **PSNR)
-    apart = run(tmp_path / "apart", [small_scene], *methods, CountMethod(), **APART)
-    assert [r["scenes"] for r in apart[:3]] == [r["scenes"] for r in here]
-    assert apart[3]["scenes"]["pattern-0"]["status"] == "ok"
+    apart = run(tmp_path / "apart", [small_scene], *methods, **APART)
+    assert [r["scenes"] for r in apart] == [r["scenes"] for r in here]
     assert "ValueError: no luck" in (tmp_path / "apart/logs/value__pattern-0.log").read_text()
     assert not list((tmp_path / "apart").glob("work/*/part-*"))
 
 
+GOOD = '["rendered", {"fit_seconds": 1, "render_fps": 1, "peak_memory_mb": 1, "model_mb": null}]'
+
+
 @pytest.mark.parametrize(
-    ("lines", "message"),
+    ("line", "message"),
     [
-        ((b"not JSON\n",), "expected a line of JSON from the fit's process"),
-        ((b'["done", null]\n',), "expected the line rendered, found ValueError: done"),
-        ((b'["rendered", {"fit_seconds": -1}]\n',), "expected numbers for fit_seconds, render_fps"),
-        ((b'["rendered", {"fit_seconds": null}]\n',), "expected numbers for fit_seconds"),
-        ((b'["failed", {"status": "ok", "reason": "so", "traceback": ""}]\n',), "so"),
-        (
-            (
-                b'["rendered", {"fit_seconds": 1, "render_fps": 1, "peak_memory_mb": 1, "model_mb": null}]\n',
-                b'["done", null]\n',
-            ),
-            "expected an image of a target, found none",
-        ),
+        ("not JSON", "expected a line of JSON from the fit's process"),
+        ('["done", null]', "expected the line rendered, found ValueError: done"),
+        ('["rendered", {"fit_seconds": -1}]', "expected numbers for fit_seconds, render_fps"),
+        ('["rendered", {"fit_seconds": null}]', "expected numbers for fit_seconds"),
+        ('["failed", {"status": "ok", "reason": "so", "traceback": ""}]', "so"),
+        (GOOD, "expected an image of a target, found none"),
     ],
 )
 def test_a_process_that_says_what_it_must_not_fails_its_cell(
-    small_scene: Path, tmp_path: Path, lines: tuple[bytes, ...], message: str
+    small_scene: Path, tmp_path: Path, line: str, message: str
 ) -> None:
-    cell = cell_of(run(tmp_path / "out", [small_scene], Lies(lines), **APART))
+    (tmp_path / "said").write_text(line + "\n")
+    liar = Apart(f"sh -c 'cat {tmp_path}/said; exec cat > {os.devnull}'")  # in the place of our program
+    cell = cell_of(run(tmp_path / "out", [small_scene], CountMethod(), apart=liar, **PSNR))
     assert cell["status"] == "failed" and message in cell["error"]
-    assert not (tmp_path / "out/predictions/lies/pattern-0").exists()
+    assert not (tmp_path / "out/predictions/counts/pattern-0").exists()
 
 
 def test_a_link_in_the_place_of_an_image_is_refused(small_scene: Path, tmp_path: Path) -> None:
@@ -186,10 +189,12 @@ def test_a_process_that_is_killed_fails_its_cell_and_the_next_run_goes_on_with_i
     small_scene: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "bullet").touch()
-    methods = (WorkerKiller("killer", tmp_path), CountMethod())
-    killed, other = run(tmp_path / "out", [small_scene], *methods, **APART)
+    killer = WorkerKiller("killer", tmp_path)
+    killed, other = run(tmp_path / "out", [small_scene], killer, CountMethod(), **APART)
     assert "its end by signal 9" in cell_of([killed])["error"] and cell_of([other])["status"] == "ok"
-    assert cell_of(run(tmp_path / "out", [small_scene], methods[0], **APART))["status"] == "ok"
+    console = Console(file=(text := io.StringIO()), width=200)
+    again = run_matrix([open_scene(small_scene)], [killer], Settings(tmp_path / "out", **APART), console)
+    assert cell_of(again)["status"] == "ok" and "resuming after" in text.getvalue(), "notes reach the caller"
     assert (tmp_path / "begins.txt").read_text().split() == ["0", "2"]
     run(tmp_path / "whole", [small_scene], CountMethod("killer"), **PSNR)
     same = "predictions/killer/pattern-0"
@@ -229,10 +234,11 @@ def test_the_process_ends_with_its_caller_and_removes_the_part(small_scene: Path
         text = process.stderr.read().decode()  # ends when no process holds the pipe
         assert text.count("KeyboardInterrupt") == 1, text
     process.stderr.close()
-    (tmp_path / "go").touch()
-    waits = dummy_methods.WaitingMethod("waits", tmp_path)
-    assert cell_of(run(tmp_path / "out", [small_scene], waits, **APART))["status"] == "ok"
-    assert files_in(tmp_path / "out/work") == {}
+    if how == "kill":
+        (tmp_path / "go").touch()
+        waits = dummy_methods.WaitingMethod("waits", tmp_path)
+        assert cell_of(run(tmp_path / "out", [small_scene], waits, **APART))["status"] == "ok"
+        assert files_in(tmp_path / "out/work") == {}
 
 
 def test_a_fit_has_a_part_of_its_own_while_a_killed_fits_process_still_ends(small_scene: Path, tmp_path: Path) -> None:
@@ -243,15 +249,6 @@ def test_a_fit_has_a_part_of_its_own_while_a_killed_fits_process_still_ends(smal
         shutil.rmtree(killed, ignore_errors=True)  # what its process does at its end
         assert (again / "scene.json").is_file()
     assert files_in(work) == {}
-
-
-def test_progress_and_notes_reach_the_caller(small_scene: Path, tmp_path: Path) -> None:
-    (tmp_path / "bullet").touch()
-    killer = WorkerKiller("killer", tmp_path)
-    run(tmp_path / "out", [small_scene], killer, **APART)
-    console = Console(file=(text := io.StringIO()), width=200)
-    run_matrix([open_scene(small_scene)], [killer], Settings(tmp_path / "out", **APART), console)
-    assert "resuming after" in text.getvalue()
 
 
 def test_the_part_is_on_the_disk_of_the_scene(small_scene: Path, tmp_path: Path) -> None:
@@ -268,13 +265,6 @@ def test_the_part_is_on_the_disk_of_the_scene(small_scene: Path, tmp_path: Path)
     assert Path(found["folder"]).parent == small_scene.parent and found["names"]["spikes/cam_00.dat"] == 2
     assert not list(small_scene.parent.glob(".spike4dgs-fit-*"))
     assert steps[-1] == (4, 4, "step 3"), "progress is passed on"
-
-
-def test_workers_fit_apart_too(small_scene: Path, tmp_path: Path) -> None:
-    records = run(tmp_path / "out", [small_scene], PlaysBack(), CountMethod(), workers=2, **APART)
-    run(tmp_path / "here", [small_scene], CountMethod(), **PSNR)
-    assert [cell_of([r])["status"] for r in records] == ["failed", "ok"]
-    assert prediction_bytes(tmp_path / "out") == prediction_bytes(tmp_path / "here")
 
 
 def has_namespaces() -> bool:
