@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from packages import install
 from skimage.metrics import peak_signal_noise_ratio
-from small_scenes import write_small_scene
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
@@ -42,21 +41,23 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     sys.modules.pop("plane_blend", None)
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Scene:
-    return open_scene(write_small_scene(tmp_path / "scene"))
+@pytest.fixture(scope="module")
+def scene(one_small_scene: Path) -> Scene:
+    return open_scene(one_small_scene)
+
+
+@pytest.fixture(scope="module")
+def predictions(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The images that the script makes, with warnings as errors."""
+    out, script = tmp_path_factory.mktemp("predictions") / "images", EXAMPLES / "predictions_only.py"
+    subprocess.run([sys.executable, "-W", "error", str(script), str(scene.root), str(out)], check=True)
+    return out
 
 
 def board(folder: Path) -> dict[str, dict[str, Any]]:
     """Rows of the only board, by method."""
     (contest,) = json.loads((folder / "local.json").read_text())["boards"]
     return {row["method"]: row for row in contest["rows"]}
-
-
-def predictions_of_the_script(scene: Scene, out: Path) -> Path:
-    script = EXAMPLES / "predictions_only.py"
-    subprocess.run([sys.executable, "-W", "error", str(script), str(scene.root), str(out)], check=True)
-    return out
 
 
 def test_the_method_is_found_through_its_entry_point(installed: Path) -> None:
@@ -110,8 +111,7 @@ def test_the_warp_follows_the_cameras(installed: Path) -> None:
     np.testing.assert_allclose(centre, [40.3, 22.8], atol=0.1)
 
 
-def test_images_of_another_program_are_scored_and_ranked(scene: Scene, tmp_path: Path) -> None:
-    predictions = predictions_of_the_script(scene, tmp_path / "images")
+def test_images_of_another_program_are_scored_and_ranked(scene: Scene, predictions: Path, tmp_path: Path) -> None:
     result, folder = tmp_path / "result.json", tmp_path / "board"
     assert main(["score", str(predictions), str(scene.root), "--out", str(result)]) == 0
     files = ["--predictions", str(predictions), "--scenes", str(scene.root)]
@@ -120,8 +120,7 @@ def test_images_of_another_program_are_scored_and_ranked(scene: Scene, tmp_path:
     assert row["rank"] == 1 and row["label"] == "re-scored" and row["mean"]["psnr"] > 5
 
 
-def test_the_program_reads_streams_as_the_benchmark_does(scene: Scene, tmp_path: Path) -> None:
-    predictions = predictions_of_the_script(scene, tmp_path / "images")
+def test_the_program_reads_streams_as_the_benchmark_does(scene: Scene, predictions: Path) -> None:
     for target in scene.targets:
         window = (max(0, target.tick - 20), min(scene.n_ticks, target.tick + 20))
         counts = [scene.stream(camera).counts(*window) for camera in scene.train]

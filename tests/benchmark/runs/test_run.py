@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import dummy_methods
 import numpy as np
 import pytest
 from changes import exchange, flip_bit, leave_part
-from dummy_methods import CountMethod, FailingMethod, prediction_bytes, run, without_timings
+from dummy_methods import CountMethod, FailingMethod, prediction_bytes, without_timings
 from rich.console import Console
 from small_scenes import write_small_scene
 
@@ -32,13 +33,15 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.weights import WeightsError
 
+run = partial(dummy_methods.run, metrics=("psnr",))
+
 
 def test_a_second_run_scores_the_files_and_fits_nothing(small_scene: Path, tmp_path: Path) -> None:
     first, again = CountMethod(), CountMethod()
-    records = run(tmp_path / "out", [small_scene], first)
+    records = dummy_methods.run(tmp_path / "out", [small_scene], first)
     assert first.fits == 1 and records == [json.loads((tmp_path / "out/results/counts.json").read_text())]
     half = leave_part(tmp_path / "out/results")
-    assert run(tmp_path / "out", [small_scene], again)[0]["scenes"] == records[0]["scenes"]
+    assert dummy_methods.run(tmp_path / "out", [small_scene], again)[0]["scenes"] == records[0]["scenes"]
     assert again.fits == 0 and not half.exists()
     assert not list((tmp_path / "out/work").iterdir()), "checkpoints of finished fits go"
 
@@ -46,7 +49,8 @@ def test_a_second_run_scores_the_files_and_fits_nothing(small_scene: Path, tmp_p
 def test_what_is_kept_and_what_is_replaced_says_why_and_refit_fits_anew(small_scene: Path, tmp_path: Path) -> None:
     def notes(*methods: Any, **settings: Any) -> str:
         console = Console(file=(text := io.StringIO()), width=200)
-        run_matrix([open_scene(small_scene)], methods, Settings(tmp_path / "out", **settings), console)
+        out = Settings(tmp_path / "out", metrics=("psnr",), **settings)
+        run_matrix([open_scene(small_scene)], methods, out, console)
         return text.getvalue()
 
     assert "kept" not in notes(CountMethod()) and "kept: predictions of 2" in notes(CountMethod())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -104,9 +105,15 @@ def test_each_further_view_is_as_far_from_the_others_as_any(
 # ---------------------------------------------------------------- scenes
 
 
+@pytest.fixture(scope="module")
+def one_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_small_scene(tmp_path_factory.mktemp("splits") / "scene", splits=True)
+
+
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    return write_small_scene(tmp_path / "scene", splits=True)
+def scene(one_scene: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(one_scene, tmp_path / "scene"))
 
 
 def test_a_scene_is_opened_with_a_split(scene: Path) -> None:
