@@ -21,6 +21,7 @@ from pathlib import Path
 import pytest
 from devtools import Page, browser
 from filelock import FileLock
+from full_scene import write_full_scene
 from hard_case import hard_case  # noqa: F401
 from small_scenes import write_small_scene
 
@@ -48,6 +49,17 @@ def one_small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small_scene(one_small_scene: Path, tmp_path: Path) -> Path:
     """A copy that a test may damage."""
     return Path(shutil.copytree(one_small_scene, tmp_path / "scene"))
+
+
+@pytest.fixture(scope="session")
+def one_full_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_full_scene(tmp_path_factory.mktemp("full") / "scene")
+
+
+@pytest.fixture
+def full_scene(one_full_scene: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(one_full_scene, tmp_path / "scene"))
 
 
 @pytest.fixture

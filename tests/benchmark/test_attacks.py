@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 import tracemalloc
 import zlib
@@ -157,6 +158,7 @@ def test_a_refused_claim_leaves_the_leaderboard_as_it_was(scored: Path, tmp_path
     before = {p: p.read_bytes() for p in board.rglob("*.json")}
     claim.write_text((scored / "record.json").read_text().replace('"fit_seconds": 1.0', f'"fit_seconds": 1{"0" * 400}'))
     refused(lambda: submit(claim, leaderboard=board, replace=True), "an integer of 401 digits")
+    assert read_record(scored / "record.json") == json.loads((scored / "record.json").read_text())
     submit(scored / "record.json", leaderboard=board)
     assert {p: p.read_bytes() for p in board.rglob("*.json")} == before
 
@@ -191,14 +193,10 @@ def test_sums_of_other_files_are_not_looked_at(scored: Path, tmp_path: Path) -> 
 # ---------------------------------------------------------------- scenes
 
 
-def changed(tmp_path: Path, name: str, old: str, new: str) -> Path:
-    """A scene whose file `name` has another text; its manifest agrees."""
-    root = write_small_scene(tmp_path / "scene", extras={"calibration": {"flat_radiance": 0.5, "flat_ticks": 4}})
-    text = (root / name).read_text()
-    assert old in text
-    (root / name).write_text(text.replace(old, new))
-    write_manifest(root)
-    return root
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    facts = {"flat_radiance": 0.5, "flat_ticks": 4}
+    return write_small_scene(tmp_path_factory.mktemp("calibrated") / "scene", extras={"calibration": facts})
 
 
 @pytest.mark.parametrize(
@@ -226,8 +224,13 @@ def changed(tmp_path: Path, name: str, old: str, new: str) -> Path:
         ("transforms_train.json", '"transform_matrix": [', '"transform_matrix": [[1e308, 0, 0, 0],'),
     ],
 )
-def test_scenes_whose_facts_do_harm(tmp_path: Path, name: str, old: str, new: str) -> None:
-    root = changed(tmp_path, name, old, new)
+def test_scenes_whose_facts_do_harm(calibrated: Path, tmp_path: Path, name: str, old: str, new: str) -> None:
+    """A scene whose file `name` has another text; its manifest agrees."""
+    root = Path(shutil.copytree(calibrated, tmp_path / "scene"))
+    text = (root / name).read_text()
+    assert old in text
+    (root / name).write_text(text.replace(old, new))
+    write_manifest(root)
     refused(lambda: open_scene(root), f"{name}|cam_03|camera")
     assert main(["verify", str(root)]) == 2
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
@@ -305,24 +308,20 @@ def test_an_exr_whose_pixels_belong_elsewhere(tmp_path: Path, windows: dict[str,
     refused(lambda: read_exr(tmp_path / "a.exr", (24, 40)), message)
 
 
-def test_an_exr_of_a_thousand_channels(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("channels", "side", "message"),
+    [
+        (1000, 24, "expected an image of at most 16 channels, found 1000"),
+        (16, 2900, "samples in all its channels, found 134560000"),
+    ],
+)
+def test_an_exr_of_many_channels(tmp_path: Path, channels: int, side: int, message: str) -> None:
     import OpenEXR
 
-    channels = {"Y": np.ones((24, 40), np.float16), **{f"c{i}": np.ones((24, 40), np.float16) for i in range(999)}}
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(
-        str(tmp_path / "a.exr")
-    )
-    refused(lambda: read_exr(tmp_path / "a.exr", (24, 40)), "expected an image of at most 16 channels, found 1000")
-
-
-def test_an_exr_of_many_channels(tmp_path: Path) -> None:
-    import OpenEXR
-
-    channels = {f"c{i}": np.zeros((2900, 2900), np.float16) for i in range(16)}
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(
-        str(tmp_path / "a.exr")
-    )
-    refused(lambda: read_exr(tmp_path / "a.exr"), "samples in all its channels, found 134560000")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    images = {f"c{i}": np.ones((24, 24), np.float16) for i in range(channels)}
+    OpenEXR.File(header, images).write(str(tmp_path / "a.exr"))
+    refused(lambda: read_exr(with_window(tmp_path / "a.exr", side, side)), message)
 
 
 @pytest.mark.parametrize("size", [(36000, 36000), (16384, 16384), (2**31 - 1, 1), (0, 0)])
@@ -396,14 +395,11 @@ def test_texts_of_model_files(tmp_path: Path, name: str, old: str, new: str, mes
         "speed record --disk-seconds inf",
     ],
 )
-def test_numbers_of_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
-    scene = write_small_scene(tmp_path / "scene")
-    arguments = command.replace("SCENE", str(scene)).replace("OUT", str(tmp_path / "out")).split()
+def test_numbers_of_commands(
+    one_small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    arguments = command.replace("SCENE", str(one_small_scene)).replace("OUT", str(tmp_path / "out")).split()
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
-
-
-def test_records_are_read_as_before(scored: Path) -> None:
-    assert read_record(scored / "record.json") == json.loads((scored / "record.json").read_text())

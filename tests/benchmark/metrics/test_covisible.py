@@ -123,8 +123,8 @@ def score(scene: Scene, folder: Path, wrong: NDArray) -> dict:
     return score_scene(open_predictions(folder, scene.targets), scene, select_metrics(("psnr",)))
 
 
-def test_pixels_that_fewer_than_two_cameras_see_do_not_count(tmp_path: Path) -> None:
-    scene = write_depth(write_small_scene(tmp_path / "scene"))
+def test_pixels_that_fewer_than_two_cameras_see_do_not_count(small_scene: Path, tmp_path: Path) -> None:
+    scene = write_depth(small_scene)
     seen = covisible(scene)["cam_03"]
     assert seen[:-1, 1:].all() and not seen[:, 0].any(), "cam_03 is the last in the row, and sees a column more"
     moving = scene.moving(scene.targets[0])
@@ -134,13 +134,12 @@ def test_pixels_that_fewer_than_two_cameras_see_do_not_count(tmp_path: Path) -> 
     assert score(scene, tmp_path / "moving", moving)["metrics"]["psnr_covisible"] < 20, "what moves always counts"
 
 
-def test_what_moves_hides_the_resting_scene_for_a_time_only(tmp_path: Path) -> None:
-    alone = covisible(write_depth(write_small_scene(tmp_path / "alone")))["cam_03"]
+def test_what_moves_hides_the_resting_scene_for_a_time_only(small_scene: Path) -> None:
+    alone = covisible(write_depth(small_scene))["cam_03"]
     hidden = np.zeros((HEIGHT, WIDTH), bool)
     hidden[4:20, 4:20] = True
-    passing = covisible(write_depth(write_small_scene(tmp_path / "passing"), (20, 60), hidden))["cam_03"]
-    assert np.array_equal(alone, passing)
-    assert (covisible(write_depth(write_small_scene(tmp_path / "stays"), (20,), hidden))["cam_03"] != alone).any()
+    assert (covisible(write_depth(small_scene, (20,), hidden))["cam_03"] != alone).any(), "it stays"
+    assert np.array_equal(covisible(write_depth(small_scene, (20, 60), hidden))["cam_03"], alone), "it passes"
 
 
 def test_fewer_training_cameras_see_fewer_pixels(tmp_path: Path) -> None:
@@ -153,31 +152,27 @@ def test_fewer_training_cameras_see_fewer_pixels(tmp_path: Path) -> None:
     assert less.sum() < more.sum() and not (less & ~more).any()
 
 
-def test_a_scene_without_depth_or_with_damaged_files_has_no_value(tmp_path: Path) -> None:
-    scene = open_scene(write_small_scene(tmp_path / "scene"))
+def test_a_scene_without_depth_or_with_damaged_files_has_no_value(small_scene: Path, tmp_path: Path) -> None:
+    scene = open_scene(small_scene)
     nothing = np.zeros((HEIGHT, WIDTH), bool)
     cell = score(scene, tmp_path / "without", nothing)
     assert cell["metrics"]["psnr_covisible"] is None and cell["metrics"]["psnr"] is not None
     assert cell["notes"]["psnr_covisible"] == "the scene has no depth of its cameras"
-    scene = write_depth(tmp_path / "scene")
-    path = next((tmp_path / "scene/geometry/cam_01").iterdir())
+    scene = write_depth(small_scene)
+    path = next((small_scene / "geometry/cam_01").iterdir())
     path.write_bytes(path.read_bytes()[:-10])
     assert score(scene, tmp_path / "damaged", nothing)["metrics"]["psnr_covisible"] is None
 
 
-def test_depth_of_another_size_is_not_used(tmp_path: Path) -> None:
-    write_depth(write_small_scene(tmp_path / "scene"))
-    path = tmp_path / "scene/geometry/cam_00/000020.exr"
+def test_depth_of_another_size_or_instant_of_each_camera_is_not_used(small_scene: Path) -> None:
+    assert covisible(write_depth(small_scene))
+    path = small_scene / "geometry/cam_00/000020.exr"
     found = read_geometry(path)
     write_geometry(path, found.depth[:-1], found.ids[:-1], found.flow[:-1], 1000.0)
-    write_manifest(tmp_path / "scene")
-    assert covisible(open_scene(tmp_path / "scene")) == {}
-
-
-def test_depth_of_another_instant_of_each_camera_is_not_used(tmp_path: Path) -> None:
-    write_depth(write_small_scene(tmp_path / "scene"))
-    folder = tmp_path / "scene/geometry/cam_00"
-    (folder / "000020.exr").rename(folder / f"{TICKS // 2:06d}.exr")
-    write_manifest(tmp_path / "scene")
-    assert covisible(open_scene(tmp_path / "scene")) == {}
-    assert Target("cam_03", 20) in open_scene(tmp_path / "scene").targets
+    write_manifest(small_scene)
+    assert covisible(open_scene(small_scene)) == {}
+    write_geometry(path, found.depth, found.ids, found.flow, 1000.0)
+    path.rename(path.with_name(f"{TICKS // 2:06d}.exr"))
+    write_manifest(small_scene)
+    assert covisible(open_scene(small_scene)) == {}
+    assert Target("cam_03", 20) in open_scene(small_scene).targets

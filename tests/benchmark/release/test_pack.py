@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from changes import files_in, flip_bit
-from full_scene import write_full_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked, read_json
@@ -166,8 +165,8 @@ def size(root: Path) -> int:
     return sum(p.stat().st_size for p in root.rglob("*") if p.is_file())
 
 
-def test_a_copy_is_smaller_and_the_same_scene(tmp_path: Path) -> None:
-    scene = open_scene(write_full_scene(tmp_path / "scene"), split="corner")
+def test_a_copy_is_smaller_and_the_same_scene(one_full_scene: Path, tmp_path: Path) -> None:
+    scene = open_scene(one_full_scene, split="corner")
     copy = counted_copy(scene, tmp_path / "copies" / "scene")
     assert copy.revision == scene.revision and copy.split == "corner"
     assert size(copy.root / "calibration") < size(scene.root / "calibration") / 2
@@ -183,8 +182,8 @@ def test_a_copy_is_smaller_and_the_same_scene(tmp_path: Path) -> None:
     assert size(again.root) == size(copy.root) and again.revision == scene.revision
 
 
-def test_a_copy_is_whole_or_absent(tmp_path: Path) -> None:
-    scene = open_scene(write_full_scene(tmp_path / "scene"))
+def test_a_copy_is_whole_or_absent(full_scene: Path, tmp_path: Path) -> None:
+    scene = open_scene(full_scene)
     (scene.root / "calibration/dark/cam_03.dat").write_bytes(b"cut off")
     with pytest.raises(UserError, match="cam_03.dat"):
         counted_copy(scene, tmp_path / "copy")
@@ -193,8 +192,8 @@ def test_a_copy_is_whole_or_absent(tmp_path: Path) -> None:
         counted_copy(scene, scene.root)
 
 
-def test_an_emulated_array_needs_the_raw_recordings(tmp_path: Path) -> None:
-    copy = counted_copy(open_scene(write_full_scene(tmp_path / "scene")), tmp_path / "copy")
+def test_an_emulated_array_needs_the_raw_recordings(one_full_scene: Path, tmp_path: Path) -> None:
+    copy = counted_copy(open_scene(one_full_scene), tmp_path / "copy")
     with pytest.raises(UserError, match=r"cam_00.npz: expected a raw recording \(.dat\), found a counted one"):
         emulated_source(copy.root, None, DARK)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -30,14 +31,20 @@ def simulated(seed: int) -> Events:
     return events(keys, [0, 20, 40, 60, TICKS], TICKS, RATE)
 
 
-@pytest.fixture
-def recorded(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def one_recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small scene with events at every camera."""
-    root = write_small_scene(tmp_path / "scene", extras=FACTS)
+    root = write_small_scene(tmp_path_factory.mktemp("events") / "scene", extras=FACTS)
     for camera in range(4):
         write_events(root / f"events/cam_{camera:02d}.npz", simulated(camera))
     write_manifest(root)
     return root
+
+
+@pytest.fixture
+def recorded(one_recorded: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(one_recorded, tmp_path / "scene"))
 
 
 def same(a: Events, b: Events) -> bool:
