@@ -109,11 +109,11 @@ def test_agreement_is_kendalls_tau_b(pairs: list[tuple[int, int]]) -> None:
     assert kendall_tau([{"mean": {"psnr": {"value": None, "published": 1.0}}}] * 3, "psnr") is None
 
 
-@pytest.fixture
-def table(small_scene: Path, tmp_path: Path) -> dict[str, Any]:
+@pytest.fixture(scope="module")
+def table(one_small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Two rows of table 1 on one scene that stands for the car, one of them failed, and a method of our own."""
     methods = (CountMethod("tfi+4dgs"), FailingMethod("dy-spikenerf", ValueError("no rays")), CountMethod("mine"))
-    records = run(tmp_path / "out", [small_scene], *methods)
+    records = run(tmp_path_factory.mktemp("table") / "out", [one_small_scene], *methods)
     return build_table(published(1), records, {scene: "car" for scene in records[0]["scenes"]})
 
 
