@@ -1,6 +1,7 @@
 """Long clips: pieces of 20 ms, each fitted from where its neighbour ends."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import torch
 from gaussian_clouds import cloud
 from saved_models import DURATION_US, gaussian_model, provenance
-from toy_fits import images
+from toy_fits import checkpoints, images, silent
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.method import FitRequest, Recipe
@@ -30,6 +31,7 @@ from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=1200, travel=0.9)
 
@@ -94,53 +96,57 @@ def test_the_next_piece_goes_on_as_the_last_one_ends(forward: bool) -> None:
     torch.testing.assert_close(speed(follower, 0.5), speed(follower, after), rtol=0, atol=1e-6)
 
 
+@cache
+def ground() -> tuple[Start, Extent, TrainingImages]:
+    """What every trainer begins with, and none changes."""
+    scene, start, spaced = WORLD.training, surfaces(WORLD.training, 0), ImageSettings(time_spacing_ticks=20)
+    extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, spaced))
+    return start, extent, make_training_images(scene, start.cameras, images, spaced, "cpu")
+
+
 OFTEN = DensitySettings(refine_every=2)
 
 
 def trainer(density: DensitySettings = OFTEN, **settings: int) -> Trainer:
-    scene, start = WORLD.training, surfaces(WORLD.training, 0)
+    scene, (start, extent, training_images) = WORLD.training, ground()
     s = TrainerSettings(coarse_steps=6, fine_steps=8, piece_steps=8, views_per_step=3, freeze_background=True)
-    s, spaced = replace(s, **settings), ImageSettings(time_spacing_ticks=20)
-    extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, spaced))
     motion = Paths(extent, PathSettings(), seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, images, spaced, "cpu")
     first = motion.initialize(from_points(start.points[::3], start.values[::3], opacity=0.5), training_images)
     loss = Pixel(Pixel.defaults, scene)
-    return Trainer(training_images, first, motion, loss, s, density, scale=extent.scale, seed=3)
+    return Trainer(training_images, first, motion, loss, replace(s, **settings), density, scale=extent.scale, seed=3)
 
 
-def quiet(done: int, total: int, note: str = "") -> None:
-    pass
+@cache
+def uninterrupted() -> tuple[Trainer, dict[int, bytes]]:
+    """A fit that has ended, and its checkpoints."""
+    whole = trainer()
+    return whole, checkpoints(whole)
 
 
 @pytest.mark.parametrize("step", [6, 13, 14, 15, 22, 29])
 def test_a_fit_of_pieces_resumes_to_the_same_bits(step: int, tmp_path: Path) -> None:
     """At the last step of a piece, and at the first and second of the next."""
-    whole, first, second = trainer(), trainer(), trainer()
-    whole.run(quiet)
-    first.total = step
-    first.run(quiet, tmp_path / "c", "this")
-    second.run(quiet, tmp_path / "c", "this")
+    (whole, saved), second = uninterrupted(), trainer()
+    (tmp_path / "c").write_bytes(saved[step])
+    second.run(silent, tmp_path / "c", "this")
     assert len(whole.pieces()) == 3
     for a, b in zip(whole.pieces(), second.pieces(), strict=True):
         assert all(torch.equal(v, b.tensors()[k]) for k, v in a.tensors().items())
 
 
 def test_a_piece_that_has_ended_stays_as_it_is() -> None:
-    fit = trainer()
+    fit, (whole, _) = trainer(), uninterrupted()
     while fit.step < 15:
         fit.train_step()
-    ended = {k: v.clone() for k, v in fit.ended[1].tensors().items()}
-    fit.run(quiet)
-    middle = fit.pieces()[1].tensors()
-    assert all(torch.equal(v, middle[k]) for k, v in ended.items())
+    middle = whole.pieces()[1].tensors()
+    assert all(torch.equal(v, middle[k]) for k, v in fit.ended[1].tensors().items())
 
 
 def test_a_cap_holds_whatever_the_images_size() -> None:
     density = DensitySettings(refine_every=2, max_gaussians=1500, grow_grad2d=0.0)
     fit = trainer(density, fine_steps=30, coarse_steps=20)
     start = len(fit.gaussians)
-    fit.run(quiet)
+    fit.run(silent)
     assert start < 1500 and len(fit.background) + 750 <= 2250
     assert all(len(g) <= max(750, start - len(fit.background)) for g in fit.pieces())
 
@@ -182,7 +188,6 @@ def test_a_time_is_rendered_by_the_piece_that_it_lies_in(tmp_path: Path) -> None
             torch.testing.assert_close(splats.means[40:], expected.means, rtol=0, atol=1e-5)
 
 
-@pytest.mark.slow
 def test_pieces_follow_what_one_path_through_a_long_clip_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     world = replace(WORLD, width=48, height=30)
     true = Initialization(lambda r: Start(r.scene.cameras, *world.surfaces(r.scene.cameras[::2], 0.01, r.seed)))

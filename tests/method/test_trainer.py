@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hard_case import BYTES, HardCase
-from toy_fits import SMALL_PLANES, WORLD, images, method, request, silent, surfaces
+from toy_fits import SMALL_PLANES, WORLD, checkpoints, images, method, request, silent, surfaces
 
 from spike4dgs.baselines.recipes import PARTS as BASELINE_PARTS
 from spike4dgs.benchmark.errors import UserError
@@ -17,10 +17,11 @@ from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, choose_ticks, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel
+from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, stages
 from spike4dgs.method.settings import make_settings, override
 from spike4dgs.method.splat import render
-from spike4dgs.method.starts.base import measure
+from spike4dgs.method.starts.base import Start, measure
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.instants import Corrections, correction, node
@@ -33,19 +34,25 @@ SUPERVISIONS = BASELINE_PARTS.supervision
 
 @cache
 def fitted(motion: str) -> FittedModel:
-    extra = {"trainer.coarse_steps": 160} if motion == "static" else {}
+    extra = {"trainer.coarse_steps": 120} if motion == "static" else {"trainer.fine_steps": 180}
     return method(motion, extra).fit(WORLD.training, request())
 
 
-@pytest.mark.slow
 def test_a_moving_board_is_seen_from_a_new_viewpoint():
     assert WORLD.psnr(fitted("hexplane"), moving=False) > 25
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["hexplane", "spacetime"])
 def test_motion_beats_a_static_scene_where_things_move(motion: str):
     assert WORLD.psnr(fitted(motion), moving=True) > WORLD.psnr(fitted("static"), moving=True) + 2
+
+
+@cache
+def ground() -> tuple[Start, Extent, TrainingImages]:
+    """What every trainer begins with, and none changes."""
+    scene, start = WORLD.training, surfaces(WORLD.training, 0)
+    settings = ImageSettings(time_spacing_ticks=40)
+    return start, measure(start, scene), make_training_images(scene, start.cameras, images, settings, "cpu")
 
 
 def trainer(
@@ -58,12 +65,10 @@ def trainer(
 ) -> Trainer:
     scene = WORLD.training
     s = TrainerSettings(coarse_steps=steps // 3, fine_steps=steps - steps // 3, views_per_step=3, **settings)
-    start = surfaces(scene, 0)
-    extent = measure(start, scene)
+    start, extent, training_images = ground()
     first = from_points(start.points[::3], start.values[::3], opacity=0.5)
     sizes = {"mlp_width": 16} if motion == "hexplane" else {}
     model = MOTIONS[motion](extent, replace(MOTIONS[motion].defaults, **sizes), seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, images, ImageSettings(time_spacing_ticks=40), "cpu")
     if spans is not None:
         training_images = replace(training_images, spans=spans(training_images))
     kind = SUPERVISIONS[supervision]
@@ -153,7 +158,7 @@ def test_corrections_made_ahead_change_no_bit(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_fit_is_freed_at_its_end() -> None:
     """Without the garbage collector, which may not come round for many fits."""
-    trainer(40, motion="paths", spans=wide_spans).run(silent)  # what the first of a process loads keeps some of it
+    uninterrupted("spans")  # what the first of a process loads keeps some of it
     gc.collect()
     gc.disable()
     try:
@@ -205,10 +210,6 @@ def test_nothing_is_averaged_before_the_number_of_gaussians_is_settled() -> None
         trainer(average=0.5)
 
 
-class Killed(Exception):
-    pass
-
-
 def tensors(t: Trainer) -> dict[str, torch.Tensor]:
     return {k: v.detach().clone() for k, v in t.state().tensors.items()}
 
@@ -226,10 +227,11 @@ PARTS_WITH_STATE = {
 
 
 @cache
-def uninterrupted(parts: str = "hexplane") -> dict[str, torch.Tensor]:
+def uninterrupted(parts: str = "hexplane") -> tuple[dict[str, torch.Tensor], dict[int, bytes]]:
+    """What a fit ends with, and its checkpoints."""
     whole = trainer(**PARTS_WITH_STATE[parts])
-    whole.run(silent)
-    return tensors(whole)
+    saved = checkpoints(whole)
+    return tensors(whole), saved
 
 
 def bits(t: dict[str, torch.Tensor]) -> bytes:
@@ -252,38 +254,30 @@ def bits(t: dict[str, torch.Tensor]) -> bytes:
     ],
 )
 def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_path, hard_case: HardCase):
+    expected, saved = uninterrupted(parts)
     path = tmp_path / "fit.safetensors"
-    first = trainer(**PARTS_WITH_STATE[parts])
-    original = first.train_step
-
-    def dies() -> torch.Tensor:
-        if first.step == step:
-            raise Killed
-        return original()
-
-    first.train_step = dies
-    with pytest.raises(Killed):
-        first.run(silent, path, "this", checkpoint_s=0)
+    path.write_bytes(saved[step])
     second = trainer(**PARTS_WITH_STATE[parts])
     second.run(silent, path, "this")
     result = tensors(second)
-    assert result.keys() == uninterrupted(parts).keys()
-    hard_case.same_bytes([bits(uninterrupted(parts)), bits(result)], ["not stopped", f"stopped at step {step}"])
+    assert result.keys() == expected.keys()
+    hard_case.same_bytes([bits(expected), bits(result)], ["not stopped", f"stopped at step {step}"])
 
 
 @pytest.mark.hard_case(asked="a fit twice with one seed", twin="the first of the two fits", **BYTES, kind="seeds")
 def test_one_seed_one_result_and_another_seed_another(hard_case: HardCase):
     again = trainer()
     again.run(silent)
-    hard_case.same_bytes([bits(uninterrupted()), bits(tensors(again))], ["the first fit", "the second"])
+    first, _ = uninterrupted()
+    hard_case.same_bytes([bits(first), bits(tensors(again))], ["the first fit", "the second"])
     other = trainer()
     other.seed = 4
     other.run(silent)
-    assert not torch.equal(tensors(other)["gaussians.means"][:50], uninterrupted()["gaussians.means"][:50])
+    assert not torch.equal(tensors(other)["gaussians.means"][:50], first["gaussians.means"][:50])
 
 
 def test_densification_changed_the_number_of_gaussians():
-    assert len(uninterrupted()["gaussians.means"]) != len(trainer().gaussians)
+    assert len(uninterrupted()[0]["gaussians.means"]) != len(trainer().gaussians)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.starts.base import Initialization, Start
+from spike4dgs.method.trainer import Trainer
 
 MOTIONS = BASELINE_PARTS.motion
 SUPERVISIONS = BASELINE_PARTS.supervision
@@ -24,6 +27,22 @@ WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.3)
 
 def silent(done: int, total: int, note: str = "") -> None:
     pass
+
+
+def checkpoints(fit: Trainer) -> dict[int, bytes]:
+    """Run a fit to its end; return what its checkpoint held before each of its steps but the first."""
+    found, train_step = {}, fit.train_step
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "fit.safetensors"
+
+        def watched() -> Any:
+            if fit.step:
+                found[fit.step] = path.read_bytes()
+            return train_step()
+
+        fit.train_step = watched  # type: ignore[method-assign]
+        fit.run(silent, path, "this", checkpoint_s=0)
+    return found
 
 
 def around(stream: SpikeStream, tick: int, settings: object) -> np.ndarray:
