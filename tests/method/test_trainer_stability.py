@@ -75,7 +75,6 @@ def fifty_steps(motion: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     return before, rendered()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["paths", "spacetime-lite"])
 def test_fifty_steps_in_float32_are_those_in_float64(motion: str) -> None:
     """To 3e-4 of white in the mean: both follow the sign of differences, which rounding flips here and there.
@@ -88,7 +87,6 @@ def test_fifty_steps_in_float32_are_those_in_float64(motion: str) -> None:
     assert (double - before).abs().mean() > 100 * error.mean()
 
 
-@pytest.mark.slow
 def test_three_seeds_agree() -> None:
     """Seeds have a standard deviation of 0.3 dB: three are hardly 1 dB apart."""
     long = method("paths", {"trainer.fine_steps": 100})
