@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 
 import pytest
 import splat_scenes
@@ -35,7 +35,7 @@ each_scene = pytest.mark.parametrize(
 )
 
 
-@lru_cache(maxsize=4)  # a scene's two rows
+@cache  # for a scene's two rows, which do not follow each other
 def parities(name: str, device: str) -> tuple[Parity, Parity]:
     """Return the parity of a scene, plain, and antialiased with depth."""
     splats, v = SCENES[name][0]()
