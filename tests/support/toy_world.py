@@ -136,6 +136,14 @@ class ToyWorld:
         cloud += noise_m * rng.normal(size=cloud.shape)
         return cloud.astype(np.float32), np.concatenate(values).astype(np.float32)
 
+    def depth_errors(self, points: NDArray[np.floating], camera: Camera | None = None) -> NDArray[np.float64]:
+        """Relative errors of the depths of what a camera, or the held-out one, sees of points, at the middle."""
+        camera = camera or self.held_out
+        uv, z = camera.project(points.astype(np.float64))
+        u, v = np.floor(uv).astype(int).T
+        seen = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        return np.abs(z[seen] / self.trace(camera, 0.5)[1][v[seen], u[seen]] - 1)
+
     def psnr(self, model: Model, moving: bool) -> float:
         """Mean over the clip, dB, of the centre camera: everywhere, or on the board only."""
         error = []
