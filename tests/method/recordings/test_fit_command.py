@@ -96,6 +96,12 @@ def _short_videos() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def no_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gray pixel for the sheet, which takes as long as all the rest."""
+    monkeypatch.setattr(fit_module, "write_sheet", lambda path, *_: Image.new("L", (1, 1)).save(path))
+
+
 def tensors(out: Path) -> dict[str, torch.Tensor]:
     from safetensors.torch import load_file
 
@@ -175,7 +181,7 @@ def test_other_commands_take_the_model(fitted: Path, recorded: Path, tmp_path: P
     assert len(list(out.iterdir())) == 5
 
 
-def test_no_file_of_truth_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_file_of_truth_is_read(tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]) -> None:
     whole = write_small_scene(tmp_path / "whole")
     bare = Path(shutil.copytree(whole, tmp_path / "bare"))
     for name in ("images", "masks", "geometry", "truth"):
@@ -192,7 +198,9 @@ def test_no_file_of_truth_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "held-out cam_03 by their own spikes: no score (not computed: the stream or the recordings of cam_03" in said
 
 
-def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_held_out_cameras_are_judged_by_their_own_spikes(
+    tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     bare = write_small_scene(tmp_path / "scene")
     for name in ("images", "masks"):
         shutil.rmtree(bare / name)
@@ -212,7 +220,9 @@ def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, capsys:
     assert page.count(f"<td>{shown[0]}</td>") == 2, "the mean over cameras too"
 
 
-def test_streams_without_poses_get_estimated_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_streams_without_poses_get_estimated_ones(
+    tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_stream_folder(tmp_path / "streams", write_streams(tmp_path / "streams"))
     out = tmp_path / "out"
     arguments = ["fit", str(tmp_path / "streams"), "--method", "tfp+4dgs", "--out", str(out), *QUICK]
@@ -265,7 +275,9 @@ def test_dark_streams_have_no_poses(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
-def test_a_second_run_makes_only_the_reports_again(fitted: Path, recorded: Path, tmp_path: Path) -> None:
+def test_a_second_run_makes_only_the_reports_again(
+    fitted: Path, recorded: Path, tmp_path: Path, no_sheet: None
+) -> None:
     out = Path(shutil.copytree(fitted, tmp_path / "out"))
     (out / REPORT).unlink()
     before, half = (out / MODEL).stat().st_mtime_ns, leave_part(out)
@@ -285,7 +297,7 @@ def test_what_cannot_be_done_is_said(
     ):
         method = () if "--method" in arguments else ("--method", "tfp+4dgs")
         budget = () if "--budget" in arguments else ("--budget", "0.02")
-        assert main(["fit", str(recorded), *arguments, *method, *budget]) == 2
+        assert main(["fit", str(recorded), *arguments, *method, *budget, "--poses", "given"]) == 2
         assert message in capsys.readouterr().err
     (tmp_path / "d").mkdir()
     with open(tmp_path / "d/.lock", "w") as lock:
@@ -294,7 +306,9 @@ def test_what_cannot_be_done_is_said(
     assert "a folder that no other fit uses" in capsys.readouterr().err
 
 
-def test_a_killed_fit_resumes(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_killed_fit_resumes(
+    recorded: Path, tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     arguments = ["fit", str(recorded), "--method", "tfp+static", "--out", str(out), *QUICK]
     code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
