@@ -22,9 +22,10 @@ from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import render
-from spike4dgs.method.starts.base import measure
+from spike4dgs.method.starts.base import Start, measure
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.training_views.training_images import TrainingImages
 
 MOTIONS = PARTS.motion
 SUPERVISIONS = PARTS.supervision
@@ -91,13 +92,26 @@ def case(name: str) -> TrainingScene:
     if name == "100,000 ticks":
         tile = stream(np.random.default_rng(0).random((100, HEIGHT, WIDTH)) < 0.3)
         long, scene = replace(tile, packed=np.tile(tile.packed, (1000, 1))), usual()
-        return replace(scene, streams=(long,) * len(scene.streams), n_ticks=long.n_ticks)
+        few = {part: getattr(scene, part)[:3] for part in ("cameras", "recordings")}
+        return replace(scene, streams=(long,) * 3, n_ticks=long.n_ticks, **few)
     if name == "NaN gain":
         return calibrated(usual(), holes(np.nan), np.zeros((HEIGHT, WIDTH)))
     if name == "NaN dark rate":
         return calibrated(usual(), np.ones((HEIGHT, WIDTH)), holes(np.nan) - 1)
     assert name == "dead pixels"
     return calibrated(usual(), holes(0.0), np.zeros((HEIGHT, WIDTH)))
+
+
+@cache
+def start() -> Start:
+    return surfaces(usual(), 0)
+
+
+@cache
+def seen(name: str, images: str, device: str) -> TrainingImages:
+    """The training images of a case, which no fit changes."""
+    scene = case(name)
+    return make_training_images(scene, scene.cameras, IMAGES[images], FEW, device)
 
 
 CASES = [
@@ -127,19 +141,17 @@ def test_losses_gradients_and_parameters_are_numbers(
         pytest.skip("TFSTP reads every tick before the image's: minutes")
     if name == "100,000 ticks" and supervision == "fixed-pattern":
         pytest.skip("its pieces are those of pixel")
-    scene, s = case(name), replace(SETTINGS, **extra)
-    start = surfaces(usual(), 0)
-    start, device = replace(start, cameras=scene.cameras), hard_case.device
-    training_images = make_training_images(scene, start.cameras, IMAGES[images], FEW, device)
+    scene, device = case(name), hard_case.device
+    first, training_images = replace(start(), cameras=scene.cameras), seen(name, images, device)
     kind, comparison = MOTIONS[motion], SUPERVISIONS[supervision]
     sizes = replace(kind.defaults, **SMALL.get(motion, {}))
-    model = kind(measure(start, scene), sizes, seeded(0, -1)).to(device)
+    model = kind(measure(first, scene), sizes, seeded(0, -1)).to(device)
     gaussians = model.initialize(
-        from_points(start.points[::8], start.values[::8], opacity=0.5, device=device), training_images
+        from_points(first.points[::8], first.values[::8], opacity=0.5, device=device), training_images
     )
     compare = comparison(replace(comparison.defaults, **loss), scene).to(device)
     density = DensitySettings(refine_every=3)
-    fit = Trainer(training_images, gaussians, model, compare, s, density, scale=1.0, seed=0)
+    fit = Trainer(training_images, gaussians, model, compare, replace(SETTINGS, **extra), density, scale=1.0, seed=0)
     while fit.step < fit.total:
         assert fit.train_step().isfinite()
         leaves = [*fit.gaussians.tensors().values(), *model.parameters(), *fit.supervision.parameters()]
