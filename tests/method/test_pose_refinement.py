@@ -109,7 +109,6 @@ def errors(cameras: tuple[Camera, ...]) -> tuple[float, float]:
     return found["rotation_deg"], found["translation_m"]
 
 
-@pytest.mark.slow
 def test_wrong_poses_become_better_and_the_image_sharp() -> None:
     before = errors(wrong(SCENE, 0).cameras)
     refined, kept = (method(refine_poses=r).fit(SCENE, FitRequest()) for r in (True, False))

@@ -38,8 +38,6 @@ def test_right_poses_stay_and_poses_a_little_off_are_mended(capsys: pytest.Captu
     assert turns_px(found) < 0.5 * turns_px(given)
     assert "the given poses are off" in capsys.readouterr().err
     assert as_in_clip(off, 0, poses=False) is off
-    again = as_in_clip(off, 0, poses=True).cameras
-    assert all(np.array_equal(a.R, b.R) and np.array_equal(a.t, b.t) for a, b in zip(again, found, strict=True))
 
 
 def test_a_clip_that_shows_too_little_changes_nothing() -> None:

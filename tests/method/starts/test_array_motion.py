@@ -54,9 +54,9 @@ def test_it_is_said_in_one_line(start, said):
     assert text.startswith(f"{WORLD.training.id}: the array moves, the image by ") and text.count("\n") == 1
 
 
-@pytest.mark.parametrize("travel", [0.25, 1.2])
-def test_an_array_that_stands_still_has_no_path_and_the_same_start(travel, capsys):
-    still = ToyWorld(width=96, height=60, n_ticks=240, travel=travel, seed=1).training
+def test_an_array_that_stands_still_has_no_path_and_the_same_start(capsys):
+    """Although a large board flies past."""
+    still = ToyWorld(width=96, height=60, n_ticks=240, travel=1.2, seed=1).training
     found, plain = rig(still, FOLLOWS), rig(still, RigSettings())
     assert found.path is None and not capsys.readouterr().err
     assert np.array_equal(found.points, plain.points) and np.array_equal(found.values, plain.values)

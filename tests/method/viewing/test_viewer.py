@@ -203,7 +203,6 @@ def shows(page: Page, image: UInt8, other: UInt8) -> bool:
     return difference(page, image) < difference(page, other) / 2
 
 
-@pytest.mark.slow
 def test_a_browser_shows_the_model_at_the_time_of_the_slider(viewer: Viewer, tmp_path: Path) -> None:
     with browser(tmp_path, webgl=True) as page:
         page.call("Page.navigate", url=viewer.url)
