@@ -124,14 +124,10 @@ def test_the_mean_of_rendered_instants_is_the_generators_frame() -> None:
 
 
 def test_first_points_of_images_lie_on_surfaces_as_often_as_those_of_spikes(scene: TrainingScene) -> None:
-    camera, (_, depth, _) = WORLD.held_out, WORLD.trace(WORLD.held_out, 0.5)
-
     def share(start: Start) -> float:
-        uv, z = camera.project(start.points.astype(np.float64))
-        u, v = np.floor(uv).astype(int).T
-        inside = (z > 0) & (u >= 0) & (u < WORLD.width) & (v >= 0) & (v < WORLD.height)
-        assert inside.sum() > 500
-        return float((np.abs(z[inside] / depth[v[inside], u[inside]] - 1) < 0.05).mean())
+        off = WORLD.depth_errors(start.points)
+        assert len(off) > 500
+        return float((off < 0.05).mean())
 
     of_spikes = share(rig(scene))
     for recorded in (edi_images(scene, tuple(range(10, 520, 10))), frame_images(scene)):
@@ -166,7 +162,7 @@ def noise(stream: SpikeStream) -> SpikeStream:
     return replace(stream, packed=np.random.default_rng(0).integers(0, 256, stream.packed.shape, dtype=np.uint8))
 
 
-@pytest.mark.parametrize("name", [recipe.name for recipe in SENSORS])
+@pytest.mark.parametrize("name", ["rgb+stg", "rgb-deblur+stg", "edi+4dgs"])  # each image, each loss, each motion
 def test_no_spike_reaches_a_row_of_other_sensors(name: str, scene: TrainingScene) -> None:
     """A fit with noise in the place of all streams has the same bits."""
     method = METHODS[name]

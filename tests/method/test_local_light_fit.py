@@ -39,8 +39,8 @@ TRUE = Initialization(lambda r: Start(r.scene.cameras, *WORLD.surfaces(r.scene.c
 PARTS = Parts({"intervals": INTERVALS}, {"true": TRUE}, MOTIONS, SUPERVISIONS)
 
 
-def fitted(coarse: int, fine: int, apart: bool = True) -> FittedModel:
-    steps = {"trainer.coarse_steps": coarse, "trainer.fine_steps": fine, "trainer.freeze_background": True}
+def fitted(apart: bool) -> FittedModel:
+    steps = {"trainer.coarse_steps": 30, "trainer.fine_steps": 70, "trainer.freeze_background": True}
     method = RecipeMethod(Recipe("test", "intervals", "true", "paths", "pixel", {**QUICK, **steps}), PARTS)
     method.algorithm = replace(method.algorithm, layers=apart)
     model = method.fit(WORLD.training, request())
@@ -48,27 +48,9 @@ def fitted(coarse: int, fine: int, apart: bool = True) -> FittedModel:
     return model
 
 
-@pytest.mark.slow
-def test_each_gaussian_has_a_share_of_the_lamp(capsys: pytest.CaptureFixture[str]) -> None:
-    own = fitted(30, 70)
-    assert "the light of a part of the scene changes" in capsys.readouterr().err
-    assert own.background.colors.shape[1] == 2 and own.light is not None
-    # What is to the right has more of the lamp, and what does not move is no foreground because its light changes.
-    right = own.background.means[:, 0] > 0.4
-    share = own.background.colors[:, 1] / own.background.colors[:, 0]
-    assert share[right].median() > 3 * share[own.background.means[:, 0] < -0.4].median()
-    assert len(own.background) > len(own.pieces[0])
-    whole = fitted(30, 70, apart=False)
-    assert "fitted in its mean" in capsys.readouterr().err
-    assert whole.background.colors.shape[1] == 1
-    for moving in (False, True):
-        assert WORLD.psnr(own, moving) > WORLD.psnr(whole, moving) + 2
-
-
-@pytest.mark.slow
-def test_what_a_viewer_takes_is_lit_as_the_render() -> None:
-    """`splats` has one gray value, `_render` both layers: the same up to rounding."""
-    model, camera = fitted(8, 12), WORLD.held_out
+def check_splats(model: FittedModel) -> None:
+    """What a viewer takes is lit as the render: `splats` has one gray value, `_render` both layers."""
+    camera = WORLD.held_out
     views = Views.from_cameras([camera])
     for share in (0.25, 0.5):
         t_us = share * WORLD.training.duration_us
@@ -77,3 +59,22 @@ def test_what_a_viewer_takes_is_lit_as_the_render() -> None:
         splats = model.splats(t_us)
         assert splats.colors.shape[1] == 1
         np.testing.assert_allclose(model.rendered(splats, views)[0].detach().clamp(min=0).numpy(), image, atol=1e-5)
+
+
+def test_each_gaussian_has_a_share_of_the_lamp_and_splats_are_lit_as_the_render(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    own = fitted(apart=True)
+    assert "the light of a part of the scene changes" in capsys.readouterr().err
+    assert own.background.colors.shape[1] == 2 and own.light is not None
+    # What is to the right has more of the lamp, and what does not move is no foreground because its light changes.
+    right = own.background.means[:, 0] > 0.4
+    share = own.background.colors[:, 1] / own.background.colors[:, 0]
+    assert share[right].median() > 3 * share[own.background.means[:, 0] < -0.4].median()
+    assert len(own.background) > len(own.pieces[0])
+    whole = fitted(apart=False)
+    assert "fitted in its mean" in capsys.readouterr().err
+    assert whole.background.colors.shape[1] == 1
+    check_splats(own)
+    for moving in (False, True):
+        assert WORLD.psnr(own, moving) > WORLD.psnr(whole, moving) + 2

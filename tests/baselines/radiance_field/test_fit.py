@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from toy_fits import silent
 from toy_world import GAIN, ToyWorld
 
 from spike4dgs.baselines.radiance_field.fit import (
@@ -42,10 +43,6 @@ SMALL = RadianceFieldSettings(
     lr_field=1e-2,
     lr_field_last=1e-3,
 )
-
-
-def silent(done: int, total: int, note: str = "") -> None:
-    pass
 
 
 def plane(camera, t: float = 0.5, travel: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

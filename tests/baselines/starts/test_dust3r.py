@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,12 +133,14 @@ def test_the_whole_path_runs_from_a_file_of_tiny_random_weights(
     save_file(tiny().state_dict(), tmp_path / "tiny.safetensors")
     monkeypatch.setenv("SPIKE4DGS_DUST3R", str(tmp_path / "tiny.safetensors"))
     monkeypatch.setattr(module, "load_dust3r", lambda path: load_dust3r(path, TINY))
+    scene = WORLD.training
+    few = replace(scene, cameras=scene.cameras[:3], streams=scene.streams[:3])
     try:
-        start = dust3r(WORLD.training, 0, SMALL)
+        start = dust3r(few, 0, SMALL)
     except UserError as e:  # random points seldom have a pose
         assert "found no consistent points" in str(e) or "cameras at different positions" in str(e)
     else:
-        assert len(start.cameras) == 8 and np.isfinite(start.points).all()
+        assert len(start.cameras) == 3 and np.isfinite(start.points).all()
 
 
 def test_resized_view_sees_the_same_scene() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
+from toy_fits import silent
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.tracking.fit import (
@@ -37,10 +38,6 @@ WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.25)
 CAMERAS = tuple(c for c in WORLD.cameras if c is not WORLD.held_out)
 TIMES = 5
 TINY = {"first_steps": 3, "later_steps": 2, "first_move": 1.0, "views_per_step": 2, "neighbours": 4}
-
-
-def silent(done: int, total: int, note: str = "") -> None:
-    pass
 
 
 @cache

@@ -146,10 +146,10 @@ def test_a_fit_through_a_lens_gives_straight_images_and_bent_ones(supervision: s
         return float(-10 * np.log10(np.mean(difference**2)))
 
     known = method.fit(curved, request())
-    pinholes = tuple(replace(c, distortion=()) for c in curved.cameras)
-    ignored = method.fit(replace(curved, cameras=pinholes), request())
     assert psnr(known, CURVED.held_out) > 24
     assert psnr(known, straight) > 24
-    assert psnr(ignored, straight) < 18
+    if supervision == "pixel":
+        pinholes = tuple(replace(c, distortion=()) for c in curved.cameras)
+        assert psnr(method.fit(replace(curved, cameras=pinholes), request()), straight) < 18, "the lens matters"
     assert isinstance(known, FittedModel)
     assert [c.distortion for c in known.cameras] == [BARREL] * len(curved.cameras)
