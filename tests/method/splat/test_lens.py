@@ -25,7 +25,7 @@ from spike4dgs.method.splat.types import CUSTOMARY
 every_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 
 
-@every_lens
+@pytest.mark.parametrize("lens", [BARREL, LENSES["tangential"]], ids=["barrel", "tangential"])  # of a fold, and none
 @pytest.mark.parametrize("scene", [scene for scene in HARD if scene is not far_origin])
 def test_hard_scenes(scene: Callable[[], tuple[Splats, Views]], lens: tuple[float, ...]) -> None:
     splats, v = scene()
