@@ -9,28 +9,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 from dummy_methods import CountMethod, WaitingMethod, run, wait_for
 
 
-class Cluster(NamedTuple):
-    """The address and the process of a scheduler, and what it wrote."""
-
-    address: str
-    scheduler: subprocess.Popen[bytes]
-    log: Path
-
-    @property
-    def workers(self) -> int:
-        """The workers that it has now."""
-        text = self.log.read_text()
-        return text.count("Register worker") - text.count("Remove worker")
-
-
 @contextmanager
-def dask_cluster(folder: Path, workers: int, **settings: str) -> Iterator[Cluster]:
-    """Yield a scheduler that has its workers. `settings` are of DASK_DISTRIBUTED."""
+def dask_cluster(folder: Path, workers: int, **settings: str) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Yield the address of a scheduler that has its workers, and its process. `settings` are of DASK_DISTRIBUTED."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{s.getsockname()[1]}"
@@ -45,9 +30,8 @@ def dask_cluster(folder: Path, workers: int, **settings: str) -> Iterator[Cluste
         for arguments, log in zip((scheduler, worker), logs, strict=True)
     ]
     try:
-        cluster = Cluster(address, started[0], folder / "scheduler.log")
-        wait_for(lambda: cluster.workers == workers)
-        yield cluster
+        wait_for(lambda: (folder / "scheduler.log").read_text().count("Register worker") >= workers)
+        yield address, started[0]
     finally:
         for process in reversed(started):
             process.terminate()

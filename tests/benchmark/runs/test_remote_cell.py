@@ -9,15 +9,14 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cluster as script
+import cluster
 import pytest
-from cluster import Cluster, dask_cluster
+from cluster import dask_cluster
 from dummy_methods import (
     CountMethod,
     FailingMethod,
@@ -42,23 +41,9 @@ PSNR: dict[str, Any] = {"metrics": ("psnr",)}
 
 
 @pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], Cluster]]:
-    """Gives a cluster of two workers, another one once a test has killed its scheduler. A task may lose one worker."""
-    with ExitStack() as stack:
-        started = list[Cluster]()
-
-        def cluster() -> Cluster:
-            if not started or started[-1].scheduler.poll() is not None:
-                folder = tmp_path_factory.mktemp("dask")
-                started.append(stack.enter_context(dask_cluster(folder, 2, SCHEDULER__ALLOWED_FAILURES="1")))
-            return started[-1]
-
-        yield cluster
-
-
-@pytest.fixture
-def cluster(running: Callable[[], Cluster]) -> Cluster:
-    return running()
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with dask_cluster(tmp_path_factory.mktemp("dask"), 2) as (address, _):
+        yield address
 
 
 def same(found: list[dict[str, Any]], expected: list[dict[str, Any]]) -> bool:
@@ -71,14 +56,14 @@ def in_background(function: Any) -> threading.Thread:
     return thread
 
 
-def test_a_killed_worker_loses_nothing(tmp_path: Path, cluster: Cluster) -> None:
+def test_a_killed_worker_loses_nothing(tmp_path: Path, scheduler: str) -> None:
     scenes = [write_small_scene(tmp_path / f"scene-{k}", seed=k) for k in range(2)]
     methods = [CountMethod("counts"), CountMethod("few", steps=2), WorkerKiller("killer", tmp_path)]
     whole = run(tmp_path / "whole", scenes, *methods, seeds=3, seed=4, **PSNR)
     assert len(whole) == 9 and len({r["mean"]["psnr"] for r in whole}) == 6, "two ways to fit, three seeds"
     (tmp_path / "begins.txt").unlink()
     (tmp_path / "bullet").touch()
-    found = run(tmp_path / "spread", scenes, *methods, seeds=3, seed=4, scheduler=cluster.address, **PSNR)
+    found = run(tmp_path / "spread", scenes, *methods, seeds=3, seed=4, scheduler=scheduler, **PSNR)
     assert same(found, whole)
     assert prediction_bytes(tmp_path / "spread") == prediction_bytes(tmp_path / "whole")
     assert sorted((tmp_path / "begins.txt").read_text().split()) == ["0"] * 6 + ["2"], "another one goes on with it"
@@ -91,11 +76,10 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path, cluster: Cluster) -> None
     assert not list((tmp_path / "spread").glob("**/work/*"))
 
 
-def test_a_killed_caller_loses_nothing_that_came_back(tmp_path: Path, small_scene: Path, cluster: Cluster) -> None:
+def test_a_killed_caller_loses_nothing_that_came_back(tmp_path: Path, small_scene: Path, scheduler: str) -> None:
     quick, waiting = CountMethod("quick"), WaitingMethod("waiting", tmp_path)
-    arguments = [str(tmp_path / "out"), str(small_scene), cluster.address, str(tmp_path)]
     caller = subprocess.Popen(
-        [sys.executable, script.__file__, *arguments],
+        [sys.executable, cluster.__file__, str(tmp_path / "out"), str(small_scene), scheduler, str(tmp_path)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
     )
     kept = tmp_path / "out/predictions/quick/pattern-0/prediction.json"
@@ -106,35 +90,35 @@ def test_a_killed_caller_loses_nothing_that_came_back(tmp_path: Path, small_scen
     assert caller.wait(30) == -signal.SIGKILL
     before = kept.read_bytes()
     (tmp_path / "go").touch()
-    found = run(tmp_path / "out", [small_scene], quick, waiting, seeds=2, scheduler=cluster.address, **PSNR)
+    found = run(tmp_path / "out", [small_scene], quick, waiting, seeds=2, scheduler=scheduler, **PSNR)
     assert kept.read_bytes() == before and quick.fits == 0
     assert same(found, run(tmp_path / "whole", [small_scene], quick, waiting, seeds=2, **PSNR))
     assert prediction_bytes(tmp_path / "out") == prediction_bytes(tmp_path / "whole")
 
 
-def test_a_lost_scheduler_is_one_error_and_what_came_back_is_kept(
-    tmp_path: Path, small_scene: Path, cluster: Cluster
-) -> None:
+def test_a_lost_scheduler_is_one_error_and_what_came_back_is_kept(tmp_path: Path, small_scene: Path) -> None:
     quick, waiting = CountMethod("quick"), WaitingMethod("waiting", tmp_path)
-    for bullet in ("bullet-1", "bullet-2"):
-        (tmp_path / bullet).touch()
-    settings = {"scheduler": cluster.address, **PSNR}
-    (killer,) = run(tmp_path / "out", [small_scene], WorkerKiller("killer", tmp_path), **settings)
-    cell = killer["scenes"]["pattern-0"]
-    assert cell["status"] == "failed" and "its workers died one after another" in cell["error"]
-    wait_for(lambda: cluster.workers == 2)  # they were started again
+    (tmp_path / "bullet").touch()
+    (tmp_path / "dask").mkdir()
+    with dask_cluster(tmp_path / "dask", 1, SCHEDULER__ALLOWED_FAILURES="0") as (address, process):
+        (killer,) = run(tmp_path / "out", [small_scene], WorkerKiller("killer", tmp_path), scheduler=address, **PSNR)
+        cell = killer["scenes"]["pattern-0"]
+        assert cell["status"] == "failed" and "its workers died one after another" in cell["error"]
 
-    def lose() -> None:
-        kept = tmp_path / "out/results/quick.json"
-        wait_for(lambda: kept.exists() and (tmp_path / "begun").exists())
-        cluster.scheduler.kill()
+        log = tmp_path / "dask/scheduler.log"
+        wait_for(lambda: log.read_text().count("Register worker") == 2)  # it was started again
 
-    thread = in_background(lose)
-    with pytest.raises(UserError, match="--scheduler: expected a scheduler that runs to the end") as e:
-        run(tmp_path / "out", [small_scene], quick, waiting, **settings)
-    assert "give the same command again" in str(e.value)
-    (tmp_path / "go").touch()
-    thread.join()
+        def lose() -> None:
+            kept = tmp_path / "out/results/quick.json"
+            wait_for(lambda: kept.exists() and (tmp_path / "begun").exists())
+            process.kill()
+
+        thread = in_background(lose)
+        with pytest.raises(UserError, match="--scheduler: expected a scheduler that runs to the end") as e:
+            run(tmp_path / "out", [small_scene], quick, waiting, scheduler=address, **PSNR)
+        assert "give the same command again" in str(e.value)
+        (tmp_path / "go").touch()
+        thread.join()
     found = run(tmp_path / "out", [small_scene], quick, waiting, **PSNR)
     assert quick.fits == 0 and waiting.fits == 1
     assert same(found, run(tmp_path / "whole", [small_scene], CountMethod("quick"), waiting, **PSNR))
