@@ -46,7 +46,7 @@ def _forward(unit: Float32, space: Float32, lines: Float32, out: Float32) -> Non
     """Set features [N, F] of points [N, 3]: planes [3, R, R, F], lines [3, R, F]."""
     size, features = lines.shape[1], lines.shape[2]
     for n in range(len(unit)):
-        look_up(space, lines, size, features, _place(unit, n, size)[0], out, n)
+        look_up(space, lines, size, features, _place(unit, n, size)[0], out, n * features)
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -59,11 +59,11 @@ def _backward(
     grad_space: Float32,
     grad_lines: Float32,
 ) -> None:
-    """Set the gradients of the points, and add those of planes and lines."""
-    size, features = lines.shape[1], lines.shape[2]
+    """Set the gradients of the points, and add those of planes and lines; `grad` may be columns of a wider array."""
+    size, features, row = lines.shape[1], lines.shape[2], grad.strides[0] // grad.itemsize
     for n in range(len(unit)):
         at, slopes = _place(unit, n, size)
-        own = add_gradients(space, lines, size, features, at, grad, n, grad_space, grad_lines)
+        own = add_gradients(space, lines, size, features, at, grad, n * row, grad_space, grad_lines)
         for axis in range(3):
             grad_unit[n, axis] = own[axis] * slopes[axis]
 

@@ -145,22 +145,23 @@ def _gradient_of(b: Any, level: _Level, to: _Level, grad: Any, at: Any) -> list[
     return [b.load(total) for total in sums]
 
 
-def _row(context: Any, builder: Any, array_type: Any, array: Any, row: Any, features: Any) -> Any:
-    return offset(builder, array_data(context, builder, array_type, array), builder.mul(row, features))
-
-
 _INTEGERS, _FLOATS = types.UniTuple(types.int64, 3), types.UniTuple(types.float32, 3)
 
 
 @intrinsic  # type: ignore[untyped-decorator]
-def look_up(typing_context: Any, space: Any, lines: Any, size: Any, features: Any, at: Any, out: Any, n: Any) -> Any:
-    """Set out[n] of [N, F]; `at`: ((i, j, k), (wi, wj, wk)), the lower node and the upper one's weight by axis."""
+def look_up(
+    typing_context: Any, space: Any, lines: Any, size: Any, features: Any, at: Any, out: Any, first: Any
+) -> Any:
+    """Set F features from element `first` of `out` on.
+
+    `at` is ((i, j, k), (wi, wj, wk)), by axis the lower node of the point's cell and the weight of the upper one.
+    """
     signature = types.void(space, lines, types.int64, types.int64, types.Tuple([_INTEGERS, _FLOATS]), out, types.int64)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         planes, axes = (array_data(context, builder, t, a) for t, a in zip(sig.args[:2], args[:2], strict=True))
         level = _Level(builder, planes, axes, *args[2:4])
-        row = _row(context, builder, sig.args[5], args[5], args[6], args[3])
+        row = offset(builder, array_data(context, builder, sig.args[5], args[5]), args[6])
 
         def body(v: Lanes, f: Any) -> None:
             values = _Values(v, level, _cells(v, args[4]), f)
@@ -174,17 +175,20 @@ def look_up(typing_context: Any, space: Any, lines: Any, size: Any, features: An
 
 @intrinsic  # type: ignore[untyped-decorator]
 def add_gradients(
-    typing_context: Any, space: Any, lines: Any, size: Any, features: Any, at: Any, grad: Any, n: Any, to_space: Any,
-    to_lines: Any,
+    typing_context: Any, space: Any, lines: Any, size: Any, features: Any, at: Any, grad: Any, first: Any,
+    to_space: Any, to_lines: Any,
 ) -> Any:  # fmt: skip
-    """Add what grad[n] of [N, F] gives to planes and lines; return the point's own gradient, per cell of each axis."""
+    """Add what F gradients, from element `first` of `grad` on, give to planes and lines.
+
+    Return the point's own gradient, per cell of each axis. All but `grad` are C-contiguous.
+    """
     place = types.Tuple([_INTEGERS, _FLOATS])
     signature = _FLOATS(space, lines, types.int64, types.int64, place, grad, types.int64, to_space, to_lines)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         data = [array_data(context, builder, sig.args[x], args[x]) for x in (0, 1, 7, 8)]
         level, to = (_Level(builder, *pair, *args[2:4]) for pair in (data[:2], data[2:]))
-        row = _row(context, builder, sig.args[5], args[5], args[6], args[3])
+        row = offset(builder, array_data(context, builder, sig.args[5], args[5]), args[6])
         own = _gradient_of(builder, level, to, row, args[4])
         return context.make_tuple(builder, sig.return_type, own)
 

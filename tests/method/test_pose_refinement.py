@@ -125,10 +125,10 @@ class Spanned(ImageMaker):
     def __call__(self, *args: object) -> np.ndarray:
         raise AssertionError("asked for images without their spans")
 
-    def with_spans(self, stream: object, ticks: list[int], *_: object) -> tuple[np.ndarray, np.ndarray]:
+    def with_spans(self, stream: object, ticks: list[int], *_: object) -> tuple[np.ndarray, np.ndarray, None]:
         images = truth(stream, ticks, 1.0)
         ends = np.array([-5, 5], np.float32)[None, :, None, None]
-        return images, np.broadcast_to(ends, (len(ticks), 2, *images.shape[1:]))
+        return images, np.broadcast_to(ends, (len(ticks), 2, *images.shape[1:])), None
 
 
 @pytest.mark.parametrize(("images", "freeze"), [("truth", True), ("spanned", False)])

@@ -111,13 +111,19 @@ def test_kernel_equals_the_plain_twin_in_value_and_gradient(seed, size, features
             assert float((fast - slow).abs().max()) <= 2e-5 * float(slow.abs().max()) + 4e-7 * term
 
 
-def test_levels_stand_side_by_side_and_do_not_mix():
+@pytest.mark.parametrize("features", [4, 16, 19])
+def test_levels_stand_side_by_side_and_do_not_mix(features):
     g = rng(4)
-    unit = torch.rand(30, 3, generator=g)
-    space = [torch.randn(3, r, r, 4, generator=g) for r in (3, 6, 11)]
-    lines = [torch.randn(3, r, 4, generator=g) for r in (3, 6, 11)]
-    each = [sample_levels(unit, [a], [s]) for s, a in zip(space, lines, strict=True)]
-    assert torch.equal(sample_levels(unit, lines, space), torch.cat(each, 1))
+    unit, sizes = torch.rand(30, 3, generator=g, requires_grad=True), (3, 6, 11)
+    space = [torch.randn(3, r, r, features, generator=g, requires_grad=True) for r in sizes]
+    lines = [torch.randn(3, r, features, generator=g, requires_grad=True) for r in sizes]
+    weight, leaves = torch.randn(30, 3 * features, generator=g), [unit, *space, *lines]
+    together = sample_levels(unit, lines, space)
+    alone = torch.cat([sample_levels(unit, [a], [s]) for s, a in zip(space, lines, strict=True)], 1)
+    assert torch.equal(together, alone)
+    gradients = (torch.autograd.grad((x * weight).sum(), leaves) for x in (together, alone))
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
 
 
 def test_start_middle_and_end_of_the_clip_train_different_rows():
