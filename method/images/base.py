@@ -133,7 +133,7 @@ class ImageMaker(Shown):
 
         images, doubts = radiance(np.stack([rate for rate, _, _ in found])), None
         if found[0][2] is not None:
-            most, one, without = np.stack([doubt for _, _, doubt in found], 1)
+            most, one, without = np.stack([doubt for _, _, doubt in found if doubt is not None], 1)
             low, high = radiance(without.copy()), radiance(without + one)
             doubts = np.stack([most, high - low, low, images - low], 1)
         return images, np.stack([spans for _, spans, _ in found]), doubts

@@ -148,8 +148,7 @@ def _gradient_of(b: Any, level: _Level, to: _Level, grad: Any, at: Any) -> list[
 _INTEGERS, _FLOATS = types.UniTuple(types.int64, 3), types.UniTuple(types.float32, 3)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def look_up(
+def _look_up(
     typing_context: Any, space: Any, lines: Any, size: Any, features: Any, at: Any, out: Any, first: Any
 ) -> Any:
     """Set F features from element `first` of `out` on.
@@ -173,8 +172,7 @@ def look_up(
     return signature, generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def add_gradients(
+def _add_gradients(
     typing_context: Any, space: Any, lines: Any, size: Any, features: Any, at: Any, grad: Any, first: Any,
     to_space: Any, to_lines: Any,
 ) -> Any:  # fmt: skip
@@ -193,3 +191,7 @@ def add_gradients(
         return context.make_tuple(builder, sig.return_type, own)
 
     return signature, generate
+
+
+look_up: Any = intrinsic(_look_up)
+add_gradients: Any = intrinsic(_add_gradients)
