@@ -121,7 +121,9 @@ def test_averages_of_exact_pairs_are_exact() -> None:
     np.testing.assert_allclose(found[1], true.centers / scale, atol=0.05)
 
 
-@pytest.mark.parametrize(("views", "seed", "turn_deg", "way_deg"), [(3, 0, 0.6, 10.0), (8, 1, 0.2, 3.0)])
+@pytest.mark.parametrize(
+    ("views", "seed", "turn_deg", "way_deg"), [(3, 0, 0.6, 10.0), (8, 1, 0.2, 3.0), (8, 2, 0.2, 3.0)]
+)
 def test_an_array_is_found_from_noisy_and_wrong_matches(views: int, seed: int, turn_deg: float, way_deg: float) -> None:
     rng = np.random.default_rng(seed)
     true = true_array(views, rng)
