@@ -19,6 +19,7 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 WIDTH, HEIGHT = 900, 540
+GONE = "Inspected target navigated or closed"
 
 
 def wait_for(what: str, check: Callable[[], Any], seconds: float = 180.0) -> Any:
@@ -44,13 +45,18 @@ class Page:
         while True:
             answer = json.loads(self._socket.recv(timeout=120))
             if answer.get("id") == self._calls:
+                if answer.get("error", {}).get("message") == GONE:
+                    raise LookupError(f"{method}: another page came while this one answered")
                 assert "error" not in answer, answer
                 return dict(answer["result"])
             self.events.append(answer)
 
     def value(self, expression: str) -> Any:
-        """Return the value of a JavaScript expression."""
-        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+        """Return the value of a JavaScript expression; None also where the page goes away before it has answered."""
+        try:
+            return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+        except LookupError:
+            return None
 
     def show(self, url: str, ready: str, width: int = WIDTH, height: int = HEIGHT) -> None:
         """Load a page in a window of that size and wait until the expression `ready` is true; errors are noted."""
