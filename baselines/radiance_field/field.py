@@ -170,7 +170,7 @@ class Deformation(nn.Module):
 
     def forward(self, points: Tensor, t: float) -> Tensor:
         """Return canonical points [N, 3] m of points [N, 3] m seen at t in [0, 1]."""
-        return points + self.scale * perceptron(self.planes(points, t), self.mlp())
+        return points + self.scale * perceptron(self.planes(points, t), self.mlp())[0]
 
     def mlp(self) -> list[Tensor]:
         """Return weights and biases of the linear layers."""

@@ -151,11 +151,9 @@ class HexPlaneMotion(Motion):
 
     def deform(self, gaussians: Gaussians, t: float) -> Gaussians:
         """Return the Gaussians at the time t in [0, 1]."""
-        final: list[Tensor] = list(self.last.parameters())  # weight, bias, weight, bias, ...
-        last = torch.block_diag(*final[0::2]), torch.cat(final[1::2])
-        layers = [self.trunk.weight, self.trunk.bias, self.hidden.weight, self.hidden.bias, *last]
+        layers = [*self.trunk.parameters(), *self.hidden.parameters(), *self.last.parameters()]
         out = perceptron(self.planes(gaussians.means, t), layers)
-        added = dict(zip(self.last, out.split(list(_CHANGES.values()), dim=-1), strict=True))
+        added = dict(zip(self.last, out, strict=True))
         added["means"], added["logits"] = added["means"] * self.scale, added["logits"][:, 0]
         return Gaussians.from_tensors({name: value + added[name] for name, value in gaussians.tensors().items()})
 

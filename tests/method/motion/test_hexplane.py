@@ -18,7 +18,6 @@ from spike4dgs.method.motion.hexplane import (
     time_sparsity,
 )
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
-from spike4dgs.method.motion.mlp import perceptron, perceptron_reference
 from spike4dgs.method.motion.table import MOTIONS
 
 SHAPE = HexPlaneShape(spatial=(5, 9), times=7, features=6, width=16)
@@ -139,22 +138,6 @@ def test_start_middle_and_end_of_the_clip_train_different_rows():
 def test_kernel_survives_points_that_are_no_numbers():
     unit = torch.tensor([[float("nan"), 0.5, 0.5], [float("inf"), -float("inf"), 0.1], [1e30, -1e30, 0.0]])
     sample_levels(unit, [torch.ones(3, 4, 2)], [torch.ones(3, 4, 4, 2)])
-
-
-@pytest.mark.parametrize("rows", [0, 1, 511, 1500])
-def test_blocked_perceptron_equals_three_layers(rows):
-    g = rng(2)
-    shapes = ((16, 8), (16,), (40, 16), (40,), (5, 40), (5,))
-    x, layers = torch.randn(rows, 8, generator=g), [torch.randn(s, generator=g) for s in shapes]
-    weight = torch.randn(rows, 5, generator=g)
-    results = []
-    for f in (perceptron, perceptron_reference):
-        leaves = [v.clone().requires_grad_(True) for v in (x, *layers)]
-        out = f(leaves[0], leaves[1:])
-        (out * weight).sum().backward()
-        results.append([out.detach(), *(v.grad for v in leaves)])
-    for fast, slow in zip(*results, strict=True):
-        assert torch.allclose(fast, slow, rtol=1e-4, atol=1e-4 * float(slow.abs().max() if slow.numel() else 1))
 
 
 def test_plane_tv_of_a_ramp_and_of_a_checkerboard():
