@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 
-def perceptron(x: Tensor, layers: list[Tensor]) -> tuple[Tensor, ...]:
+def perceptron(x: Tensor, layers: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """Return V_j relu(W2 relu(W1 x + b1) + b2)_j + c_j, one [N, size] a head j, for rows x [N, D].
 
     `layers` is [W1, b1, W2, b2, V_0, c_0, V_1, c_1, ...]. The second layer's outputs are cut into as many equal parts
@@ -19,7 +21,7 @@ def perceptron(x: Tensor, layers: list[Tensor]) -> tuple[Tensor, ...]:
     return perceptron_on_cpu(x, layers)
 
 
-def perceptron_reference(x: Tensor, layers: list[Tensor]) -> tuple[Tensor, ...]:
+def perceptron_reference(x: Tensor, layers: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """Return the same in plain torch, on any device."""
     w1, b1, w2, b2, *heads = layers
     h = ((x @ w1.T + b1).relu() @ w2.T + b2).relu()

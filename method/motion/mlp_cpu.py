@@ -2,11 +2,12 @@
 
 All widths are small, where a library's product of matrices reaches half of what the processor can do. A tile here is 4
 rows by 16 columns, whose sums stay in registers: it reaches nine tenths. The gradient computes the activations again,
-which takes no longer than to read them from memory. Sums have one order on any number of cores and on any processor.
+which takes no longer than to read them from memory. Sums have one order on any number of cores.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -224,7 +225,7 @@ def _halves(rows: int) -> tuple[slice, slice]:
     return slice(0, cut), slice(cut, rows)
 
 
-def perceptron_on_cpu(x: Tensor, layers: list[Tensor]) -> tuple[Tensor, ...]:
+def perceptron_on_cpu(x: Tensor, layers: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """Return what `mlp.perceptron` says, of float32 tensors on the CPU."""
     out: tuple[Tensor, ...] = _Perceptron.apply(x, *layers)
     return out
