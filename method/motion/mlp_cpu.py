@@ -90,7 +90,7 @@ _wide, _narrow, _column = _strip(2, WIDTH), _strip(1, WIDTH), _strip(1, 1)
 @njit(nogil=True, error_model="numpy")
 def add_product(
     a: Any, at_a: int, row_a: int, next_a: int, b: Any, at_b: int, row_b: int, c: Any, at_c: int, row_c: int,
-    m: int, n: int, k: int, floor: np.float32 = ANY,
+    m: int, n: int, k: int, floor: np.float32,
 ) -> None:  # fmt: skip
     """Set C [M, N] to max(C + A [M, K] B [K, N], floor); see `_tile` for where their elements are."""
     wide, narrow = n - n % (2 * WIDTH), n - n % WIDTH
@@ -116,8 +116,10 @@ def _activations(x: Any, at: int, w: Any, bias: Any, out: Any, n: int) -> None:
 def _forward(
     x: Float32, w1: Float32, b1: Float32, w2: Float32, b2: Float32, w3: Float32, b3: Float32, out: Float32
 ) -> None:
-    """Set out [N, heads * P], where P is a head's size, padded. Matrices are transposed: w3 [heads, H2 / heads, P]."""
-    heads, width, p = w3.shape
+    """Set out [N, heads * P], P a head's size, padded. Matrices are transposed: w3 [H2, P], one head after another."""
+    p = w3.shape[1]
+    heads = out.shape[1] // p
+    width = len(w3) // heads
     h1, h2 = np.empty((BLOCK, w1.shape[1]), np.float32), np.empty((BLOCK, w2.shape[1]), np.float32)
     for at in range(0, len(x), BLOCK):
         n = min(BLOCK, len(x) - at)
@@ -128,7 +130,7 @@ def _forward(
                 out[at + r, i] = b3[i]
         for head in range(heads):
             to = (at * heads + head) * p
-            add_product(h2, head * width, h2.shape[1], 1, w3, head * width * p, p, out, to, heads * p, n, p, width)
+            add_product(h2, head * width, h2.shape[1], 1, w3, head * width * p, p, out, to, heads * p, n, p, width, ANY)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -143,8 +145,8 @@ def _gradients(x: Any, at: int, h: Any, grad: Any, w: Any, to_x: Any, to_w: Any,
         for i in range(m):
             total[i] += grad[r, i]
     to_bias += total
-    add_product(grad, 0, m, 1, w, 0, k, to_x, at * k, k, n, k, m)
-    add_product(grad, 0, 1, m, x, at * k, k, to_w, 0, k, m, k, n)
+    add_product(grad, 0, m, 1, w, 0, k, to_x, at * k, k, n, k, m, ANY)
+    add_product(grad, 0, 1, m, x, at * k, k, to_w, 0, k, m, k, n, ANY)
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -171,8 +173,8 @@ def _backward(
         first = 0
         for head, size in enumerate(sizes):
             of_grad, of_h, of_w = at * total + first, head * width, first * width
-            add_product(grad, of_grad, total, 1, w3, of_w, width, g2, of_h, h2.shape[1], n, width, size)
-            add_product(grad, of_grad, 1, total, h2, of_h, h2.shape[1], to_weights[2], of_w, width, size, width, n)
+            add_product(grad, of_grad, total, 1, w3, of_w, width, g2, of_h, len(w2), n, width, size, ANY)
+            add_product(grad, of_grad, 1, total, h2, of_h, len(w2), to_weights[2], of_w, width, size, width, n, ANY)
             first += size
         _gradients(h1, 0, h2, g2, w2, g1, to_weights[1], to_biases[1], n)
         _gradients(x, at, h1, g1, w1, to_x, to_weights[0], to_biases[0], n)
@@ -185,13 +187,15 @@ class _Perceptron(torch.autograd.Function):
         w, biases = ([layer.detach().numpy() for layer in layers[k::2]] for k in range(2))
         widest = max(len(head) for head in w[2:])
         p = widest + -widest % WIDTH
-        w3, b3 = np.zeros((heads, w[2].shape[1], p), np.float32), np.zeros((heads, p), np.float32)
+        w3, b3 = np.zeros((heads, w[2].shape[1], p), np.float32), np.zeros((heads, p), np.float32)  # padded with zeros
         for i, (head, bias) in enumerate(zip(w[2:], biases[2:], strict=True)):
             w3[i, :, : len(head)], b3[i, : len(head)] = head.T, bias
         out, transposed = np.empty((len(rows), heads * p), np.float32), [np.ascontiguousarray(a.T) for a in w[:2]]
 
         def work(part: slice) -> None:
-            _forward(rows[part], transposed[0], biases[0], transposed[1], biases[1], w3, b3.ravel(), out[part])
+            _forward(
+                rows[part], transposed[0], biases[0], transposed[1], biases[1], w3.reshape(-1, p), b3.ravel(), out[part]
+            )
 
         on_two_threads(work, *_halves(len(rows)))
         ctx.save_for_backward(x, *layers)
