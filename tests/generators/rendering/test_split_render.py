@@ -230,5 +230,6 @@ def test_what_has_left_all_views_leaves_the_background(r):
 
     own = renderer(replace(r.world, poses=poses), static=r.static)
     assert own.traced(T_S).any() and not own.traced(1.5).any()
-    # of many rays one may meet an edge, and hit the other triangle where the scene holds more: 8e-6 on one processor
-    np.testing.assert_allclose(own.keys(1.5), r.background, rtol=1e-3)
+    # on one processor a sample of soft light is another where the scene holds more: 9 pixels, off by 8e-6
+    assert (found := own.keys(1.5)).shape == r.background.shape and (found != r.background).mean() < 0.01
+    np.testing.assert_allclose(found, r.background, rtol=1e-4)
