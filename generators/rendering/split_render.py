@@ -156,9 +156,10 @@ class SplitRenderer(MultiViewRenderer):
             if len(self._spreads) >= _MOST_MAPS:  # times usually ascend, as of maps
                 del self._spreads[min(self._spreads)]
             near, own = _around(self.object_masks(t_s), _NEAR_PX), _PILOTS + round(t_s * 1e7)
-            half = (0.5, self._map(t_s))  # twice: so it is the kernel of keys
+            # twice, and not in the same memory: so it is the kernel of keys
+            halves = [(0.5, known) for known in (self._map(t_s), self._make_map(t_s))]
             self._scene.set_time(t_s)
-            self._spreads[t_s] = self._piloted(near, own, True, [half, half])
+            self._spreads[t_s] = self._piloted(near, own, True, halves)
         return self._spreads[t_s]
 
     def _piloted(self, chosen: np.ndarray, stream: int, moving: bool, maps: list[tuple[float, Any]]) -> np.ndarray:
