@@ -73,7 +73,8 @@ RECIPES = (
 )
 
 # The same given what `spike4dgs-x` is given: images and first points corrected by the cameras' calibrations. Spk2ImgNet
-# still sees raw spikes; its images are corrected. `adaptive` with 4DGS is in `method.recipes`.
+# still sees raw spikes; its images are corrected, but for the mean dark rate, which it has learnt to leave out.
+# `adaptive` with 4DGS is in `method.recipes`.
 CALIBRATED = (
     *(
         Recipe(

@@ -84,6 +84,11 @@ class Calibration(Shown):
         """Return the response with dark rates `scale` times as high: itself for 1."""
         return self if scale == 1 else replace(self, dark=self.dark * np.float32(scale))
 
+    @property
+    def mean_dark(self) -> np.float32:
+        """The mean dark rate of the pixels that respond to light, in spikes per tick."""
+        return np.float32(self.dark[self.gain > 0].mean())
+
     def radiance(self, rate: Float32) -> Float32:
         """Return the linear radiance of rates [..., H, W] in spikes per tick; pixels without sensitivity give 0."""
         light = np.maximum(rate - self.dark, 0)

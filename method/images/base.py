@@ -70,6 +70,7 @@ class ImageMaker(Shown):
     settings: Settings = Settings()  # the maker's own numbers (prefix `image_maker`)
     learned: Callable[[], Learned | None] = lambda: None  # the weights in use; None: nothing is learned, or none there
     corrected: Callable[[SpikeStream, int, Calibration], Float32] | None = None
+    without_dark: bool = False  # `rate` has lost the mean dark rate already, as a network learns from ground truth
     # Rate, the spans [2, H, W] that it is a mean over, and their doubts, see `with_spans`; None: rates are of instants.
     rate_over: Callable[..., tuple[Float32, Float32, Float32 | None]] | None = None
     knows_light: bool = False  # `rate` and `rate_over` take `light`, see `images.light`; else they take it as steady
@@ -143,6 +144,8 @@ class ImageMaker(Shown):
         if camera is None:
             images /= gain
             return images
+        if self.without_dark:
+            images += camera.mean_dark
         found = images / np.float32(camera.radiance_gain) if self.corrected else camera.radiance(images)
         found[:, ~(camera.gain > 0)] = np.nan
         return found

@@ -76,6 +76,7 @@ def spk2img_maker(device: str) -> ImageMaker:
         "stream, CVPR 2021",
         rate=lambda stream, tick, _: spk2img_image(stream, tick, device),
         learned=partial(learned_from, WEIGHTS.in_use, WEIGHTS.read_card),
+        without_dark=True,
         made_on=spk2img_maker,
         label="by Spk2ImgNet",
     )

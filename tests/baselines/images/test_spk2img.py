@@ -28,6 +28,7 @@ from spike4dgs.baselines.images.spk2img.train import (
 )
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.options import Compute
@@ -252,3 +253,26 @@ def test_foreign_and_damaged_weights_are_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(UserError, match="expected weights of Spk2ImgNet, found damaged data"):
         WEIGHTS.read_card(path)
+
+
+def test_the_weights_have_learnt_to_leave_out_what_a_sensor_has_in_the_dark() -> None:
+    dark, phase, ticks = 0.005, np.random.default_rng(0).random((24, 32)), np.arange(62)[:, None, None]
+    for light in (0.02, 0.06, 0.12):
+        spikes = np.diff(np.floor(phase + (light + dark) * ticks), axis=0) > 0
+        found = maker.spk2img_image(stream_of(spikes), 30, "cpu").mean()
+        assert abs(found - light) < 0.6 * abs(found - light - dark)
+
+
+def test_a_calibration_takes_off_what_the_network_has_left_of_the_dark() -> None:
+    """That is how far a pixel's dark rate is from the camera's mean; a dead pixel has no part in the mean."""
+    rng = np.random.default_rng(1)
+    light, gain, dark = (
+        rng.uniform(*bounds, (6, 7)).astype(np.float32) for bounds in ((0.1, 0.8), (0.9, 1.1), (0, 0.01))
+    )
+    gain[2, 3], dark[2, 3] = 0, 0.5
+    camera = Calibration(gain, dark, 0.6)
+    learnt = 0.6 * light * gain + dark - dark[gain > 0].mean()
+    spk2img = replace(IMAGES["spk2img"], rate=lambda *_: learnt.copy())
+    found = spk2img(stream_of(np.zeros((9, 6, 7), bool)), [4], gain=0.6, camera=camera)[0]
+    assert np.isnan(found[2, 3])
+    np.testing.assert_allclose(found[gain > 0], light[gain > 0], rtol=1e-5)
