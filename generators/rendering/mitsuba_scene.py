@@ -56,8 +56,7 @@ class MitsubaScene:
     def __init__(self, world: WorldScene) -> None:
         mi = load_mitsuba()
         self._world = world
-        # one object for all scenes: kernels hold its number, so those of other scenes are the same and compiled once
-        lamps = {name: mi.load_dict(_emitter(spec)) for name, spec in world.emitters.items()}
+        lamps = {name: _emitter(spec) for name, spec in world.emitters.items()}
         static = lamps | _shapes("static", _in_palettes(world.static))
         self._batches = _batches(world)
         moving, plain = (

@@ -145,24 +145,6 @@ def test_kernels_serve_all_lists_of_pixels_and_numbers_of_samples(r):
 
 
 @one_world
-def test_the_scenes_of_a_world_share_their_kernels(r):
-    """A kernel holds the numbers of lamps; another lamp for the scene without objects would be another kernel."""
-    import drjit as dr
-
-    def kernels(moving: bool) -> set[str]:
-        dr.kernel_history_clear()
-        r._tracer.trace(where, 4, where, moving)
-        r._tracer.soft(where, 4, where, moving, gloss=False)
-        r._tracer.soft(where, 4, where, moving, gloss=True)
-        return {kernel["hash"] for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT}
-
-    where = np.arange(40)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        kernels(moving=True), kernels(moving=False)  # recordings have a few more
-        assert (found := kernels(moving=True)) and found == kernels(moving=False)
-
-
-@one_world
 def test_garbage_is_collected_before_or_after_a_recording(r, monkeypatch):
     """An array of NumPy's memory that is freed in a recording ends the process: an old renderer's, at any time."""
     import mitsuba as mi
