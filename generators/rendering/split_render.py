@@ -156,10 +156,9 @@ class SplitRenderer(MultiViewRenderer):
             if len(self._spreads) >= _MOST_MAPS:  # times usually ascend, as of maps
                 del self._spreads[min(self._spreads)]
             near, own = _around(self.object_masks(t_s), _NEAR_PX), _PILOTS + round(t_s * 1e7)
-            # twice, and not in the same memory: so it is the kernel of keys
-            halves = [(0.5, known) for known in (self._map(t_s), self._make_map(t_s))]
+            half = (0.5, self._map(t_s))  # twice, as keys have two; one array twice is another kernel than theirs
             self._scene.set_time(t_s)
-            self._spreads[t_s] = self._piloted(near, own, True, halves)
+            self._spreads[t_s] = self._piloted(near, own, True, [half, half])
         return self._spreads[t_s]
 
     def _piloted(self, chosen: np.ndarray, stream: int, moving: bool, maps: list[tuple[float, Any]]) -> np.ndarray:
