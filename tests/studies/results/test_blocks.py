@@ -43,6 +43,7 @@ from spike4dgs.studies.results.tables.parts import SWITCHES, own_scenes_block, p
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 from spike4dgs.studies.results.tables.realistic import GROUP as TRACK_SMALL
 from spike4dgs.studies.results.tables.realistic import cameras_block, realistic_block
+from spike4dgs.studies.results.tables.steps import GROUPS as STEPS
 from spike4dgs.studies.results.tables.steps import steps_block
 
 SHOWN = {  # a block -> two rows that it has, if not those of the tables
@@ -234,7 +235,7 @@ def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name
         "modality-noisy": NOISY,
         "parts": PARTS,
         "realistic": TRACK_SMALL,
-        "steps": PARTS,
+        "steps": STEPS[0],
         "table2": TABLE2,
     }
     scenes = of.get(name.removesuffix("-scenes"), NINE).scenes
@@ -506,13 +507,13 @@ def test_a_part_is_worth_what_its_absence_costs():
 
 def test_more_steps_stand_beside_a_rows_own():
     gains = {1.0: 0, 4.0: 1.5, 16.0: 2}
-    found = [record("tfp+stg", s, 30.0 + gain, budget=b) for b, gain in gains.items() for s in PARTS.scenes]
-    found += [record("tfp+4dgs", s, 31.0) for s in PARTS.scenes]
+    found = [record("tfp+stg", s, 30.0 + gain, budget=b) for b, gain in gains.items() for s in STEPS[0].scenes]
+    found += [record("tfp+4dgs", s, 31.0) for s in STEPS[0].scenes]
     lines = steps_block(found)
     assert "| `tfp+stg` | 32.00 / 30.00 | +1.50 / +1.50 | +2.00 / +2.00 |" in lines
     assert (
         "| `tfp+4dgs` | 33.00 / 31.00 | - | - |" in lines
-        and "budgets quick, standard, 16; 12 of 54 planned" in lines[-1]
+        and "budgets quick, standard, 16; 12 of 72 planned" in lines[-1]
     )
 
 
