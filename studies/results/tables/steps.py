@@ -11,7 +11,7 @@ from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import Group, once
 from spike4dgs.studies.results.records import Record
 
-SCENES = ("car-11-small", "jaywalk-11-small", "turntable-11-small")
+SCENES = ("car-11-small", "jaywalk-11-small", "bird-11-small")
 ROWS = (
     "spike4dgs-x",
     "spike4dgs",
