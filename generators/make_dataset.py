@@ -293,5 +293,6 @@ def _lines(console: Console, title: str, steps: Iterable[T], total: int) -> Iter
         now = time.perf_counter()
         if done == total or now - shown > _LINE_EVERY_S:
             shown = now
-            left = "" if done == total else f", {left_text(pace.left())}"
-            console.print(f"{title} {done}/{total}, {seconds_text(now - start)}{left}", markup=False)
+            left = "" if done == total else left_text(pace.left())
+            facts = [f"{title} {done}/{total}", seconds_text(now - start), *([left] if left else [])]
+            console.print(", ".join(facts), markup=False)

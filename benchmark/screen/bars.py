@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 _NOTEBOOK_EVERY_S = 0.2  # between two images of the bars
+_FEW = 20  # steps; of more than that the first alone tells too little of the others
 
 
 class Pace:
@@ -38,10 +39,12 @@ class Pace:
         self._last = done, total, now
 
     def left(self) -> float | None:
-        """Return the seconds left; None before the first step has ended."""
+        """Return the seconds left; None before the first step has ended, of many steps before the second."""
         if self._first is None:
             return None
         (first, since), (done, total, then) = self._first, self._last
+        if done == first and total > _FEW * done:
+            return None
         a_step = (then - since) / (done - first) if done > first else (then - self._begun) / done
         return max(0.0, a_step * (total - done) - (self._clock() - then))
 

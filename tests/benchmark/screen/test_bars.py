@@ -37,6 +37,16 @@ def test_even_steps_after_a_slow_first_one_have_an_exact_estimate_at_once() -> N
     assert pace.left() == 0.0
 
 
+def test_the_first_of_many_steps_gives_no_estimate_alone() -> None:
+    """A renderer compiles for a minute before its first key frame: 401 of them take no hours."""
+    clock = Clock()
+    pace = Pace(clock)
+    for now, done, left in ((60.0, 1, None), (62.0, 2, 2.0 * 399)):
+        clock.now = now
+        pace.at(done, 401)
+        assert pace.left() == left
+
+
 def test_a_step_that_lasts_lets_the_estimate_count_down() -> None:
     clock = Clock()
     pace = Pace(clock)
