@@ -20,7 +20,7 @@ from spike4dgs.studies.results.sweep import SweepSettings, sweep
 from spike4dgs.studies.results.tables import conditions, modality, parts, realistic, steps
 from spike4dgs.studies.results.tables.images import TABLE6
 
-_GROUPS = (
+EVERY_GROUP = (
     *PLAN,
     TABLE6,
     *ABLATIONS,
@@ -104,10 +104,10 @@ def results(
 
 
 def _cells(choice: Choice) -> list[Cell]:
-    known = {group.name: group for group in (*_GROUPS, TRIAL)}
+    known = {group.name: group for group in (*EVERY_GROUP, TRIAL)}
     if unknown := [name for name in choice.only if name not in known]:
         raise problem("--only", f"groups among {', '.join(known)}", ", ".join(unknown), "correct the names")
-    cells = cells_of([known[name] for name in choice.only] or _GROUPS)
+    cells = cells_of([known[name] for name in choice.only] or EVERY_GROUP)
     rows = dict.fromkeys(cell.row for cell in cells)
     if unknown := [name for name in choice.rows if name not in rows]:
         raise problem("--rows", f"rows among {', '.join(rows)}", ", ".join(unknown), "correct the names")

@@ -136,7 +136,7 @@ def ablation(name: str, table: PublishedTable, scenes: tuple[str, ...], split: s
 
 def once(names: Iterable[str]) -> tuple[Row, ...]:
     """Return rows with one seed, as the main tables have them and others too."""
-    known = {row.name: replace(row, seeds=1) for row in ROWS}
+    known = {row.name: replace(row, seeds=1) for row in ALL_ROWS}
     return tuple(known.get(name) or Row(name, tuned_on=_tuned_on(name)) for name in names)
 
 

@@ -13,6 +13,7 @@ from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.generators.make_dataset import SceneSettings, track_jobs
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.tuned import SUFFIX as TUNED
+from spike4dgs.studies.results.command import EVERY_GROUP
 from spike4dgs.studies.results.plan import (
     ABLATIONS,
     CALIBRATED,
@@ -28,6 +29,7 @@ from spike4dgs.studies.results.plan import (
     cells_of,
     knowledge_of,
 )
+from spike4dgs.studies.results.tables.steps import GROUPS as STEPS
 
 METHODS = find_methods()
 MOTIONS = ("4dgs", "stg", "d3dgs")
@@ -63,6 +65,13 @@ def test_a_row_is_tuned_where_a_search_of_it_is_kept() -> None:
     for name in searched.keys() & rows.keys():
         assert rows[f"{name}{TUNED}"].seeds == rows[name].seeds
         assert all(scene in rows[f"{name}{TUNED}"].tuned_on for scene in searched[name]["scenes"])
+
+
+def test_a_row_is_tuned_on_the_same_scenes_in_every_group() -> None:
+    tuned_on = {row.name: row.tuned_on for row in TABLE1.rows}
+    rows = [row for group in EVERY_GROUP for row in group.rows if row.name in tuned_on]
+    assert any(row.name.endswith(TUNED) for group in STEPS for row in group.rows)
+    assert [row for row in rows if row.tuned_on != tuned_on[row.name]] == []
 
 
 def test_a_calibrated_row_is_one_whose_recipe_is_given_flat_fields() -> None:
