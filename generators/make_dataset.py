@@ -294,5 +294,5 @@ def _lines(console: Console, title: str, steps: Iterable[T], total: int) -> Iter
         if done == total or now - shown > _LINE_EVERY_S:
             shown = now
             left = "" if done == total else left_text(pace.left())
-            facts = [f"{title} {done}/{total}", seconds_text(now - start), *([left] if left else [])]
-            console.print(", ".join(facts), markup=False)
+            facts = f"{title} {done}/{total}", seconds_text(now - start), left
+            console.print(", ".join(filter(None, facts)), markup=False)
