@@ -248,12 +248,25 @@ def _version(package: str) -> str | None:
 
 
 def cpu_name() -> str:
-    """Return the processor's model and the cores that this process may use."""
+    """Return the processor and the cores that this process may use."""
     try:
-        found = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
+        facts = Path("/proc/cpuinfo").read_text()
     except OSError:
-        found = None
-    return f"{found[1].strip() if found else platform.machine()}, {available_cores()} cores"
+        facts = ""
+    return f"{processor(facts)}, {available_cores()} cores"
+
+
+def processor(cpuinfo: str) -> str:
+    """Return the processor that `/proc/cpuinfo` tells of, with family and model where it has them.
+
+    The name alone is not enough: clouds call three generations "AMD EPYC", and a fit takes three times as long on one.
+
+    >>> processor("cpu family : 26\\nmodel : 2\\nmodel name : AMD EPYC")
+    'AMD EPYC (family 26, model 2)'
+    """
+    found = dict(re.findall(r"^(model name|cpu family|model)[ \t]*:[ \t]*(\S.*)$", cpuinfo, re.M))
+    kind = f" (family {found['cpu family']}, model {found['model']})" if {"cpu family", "model"} <= set(found) else ""
+    return found.get("model name", platform.machine()).strip() + kind
 
 
 def available_cores() -> int:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import platform
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 from dummy_methods import CountMethod, FailingMethod, run
 
-from spike4dgs.benchmark.environment import harness
+from spike4dgs.benchmark.environment import harness, processor
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import MethodInfo
@@ -49,6 +50,13 @@ def made(scenes: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Record
 @pytest.fixture
 def record(made: Record) -> Record:
     return copy.deepcopy(made)
+
+
+def test_processors_of_one_name_are_told_apart() -> None:
+    facts = "processor\t: {0}\ncpu family\t: 25\nmodel\t\t: {1}\nmodel name\t: AMD EPYC\n\n"
+    milan, genoa = (processor("".join(facts.format(core, model) for core in range(2))) for model in (1, 17))
+    assert (milan, genoa) == ("AMD EPYC (family 25, model 1)", "AMD EPYC (family 25, model 17)")
+    assert processor("CPU part\t: 0xd0c\n") == processor("") == platform.machine(), "ARM tells no name"
 
 
 def test_a_record_says_what_ran_on_what(record: Record) -> None:
