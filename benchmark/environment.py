@@ -264,7 +264,8 @@ def processor(cpuinfo: str) -> str:
     >>> processor("cpu family : 26\\nmodel : 2\\nmodel name : AMD EPYC")
     'AMD EPYC (family 26, model 2)'
     """
-    found = dict(re.findall(r"^(model name|cpu family|model)[ \t]*:[ \t]*(\S.*)$", cpuinfo, re.M))
+    lines = re.findall(r"^(model name|cpu family|model)[ \t]*:[ \t]*(\S.*)$", cpuinfo, re.M)
+    found: dict[str, str] = dict(lines)  # of all cores, the last one's
     kind = f" (family {found['cpu family']}, model {found['model']})" if {"cpu family", "model"} <= set(found) else ""
     return found.get("model name", platform.machine()).strip() + kind
 
