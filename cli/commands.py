@@ -205,7 +205,7 @@ COMMANDS: dict[str, Command] = {
     "release publish": Command(
         "spike4dgs.cli.release:publish",
         "upload a release to Zenodo, Hugging Face or a web server; with --dry-run show what would be sent",
-        "release publish releases/2 --to zenodo-sandbox --dry-run",
+        "release publish releases/2-flat --to zenodo-sandbox --dry-run",
     ),
     "release wheel": Command(
         "spike4dgs.cli.release:wheel",

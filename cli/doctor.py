@@ -29,7 +29,7 @@ _UNATTENDED_WIDTH = 120  # where the output is no terminal
 OPTIONAL = (
     ("viser", "viewer", "`view`"),
     ("distributed", "cluster", "`--scheduler` on many machines"),
-    ("dask-jobqueue", "cluster", "`--scheduler slurm`"),
+    ("dask-jobqueue", "cluster", "batch jobs of SLURM, as in docs/cluster.md"),
     ("pandas", "pandas", "results as data frames"),
 )
 # Library, its Debian package, and what needs it.

@@ -43,7 +43,7 @@ class SceneSettings:
     Args:
         profile: tiny (4 views, 64x40, 4 ms: for tests), small (9 views, 200x125, 20 ms), paper (9, 400x250, 100 ms).
         seed: Seed of all random numbers: the world's details, the rendering, the sensors.
-        variant: Variant of the world; 0 is the public benchmark, 9000 and up are kept for hidden seasons.
+        variant: Variant of the world; 0, 3 and 4 are the public benchmark, 9000 and up are kept for hidden seasons.
         seconds: Length of the clip if not the profile's, in whole milliseconds.
         gain_map: Give every pixel its own sensitivity.
         dark_map: Give every pixel its own dark rate.

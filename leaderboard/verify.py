@@ -18,7 +18,7 @@ from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.held_out import has_truth
-from spike4dgs.benchmark.runs.predictions import SUMS
+from spike4dgs.benchmark.runs.predictions import SUMS, read_info
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record, same_value, sensor_of
 from spike4dgs.benchmark.runs.score import open_for, prediction_folders, score_scene
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
@@ -97,15 +97,15 @@ def verify_record(
 
 def _check_scene(scene: Scene, dataset: Mapping[str, Any]) -> None:
     """Raise UserError unless a scene is the one of a record's dataset, or the release's that this is equivalent to."""
-    revision, equivalent = dataset["scenes"][scene.id], dataset.get("equivalent", {}).get(scene.id)
-    if scene.revision not in (revision, equivalent and equivalent["revision"]):
+    revision, *equivalent = _revisions(scene.id, dataset)
+    if scene.revision not in (revision, *equivalent):
         fix = "give the scene that was scored, or score again"
         raise problem(scene.root, f"scene revision {revision[:16]}...", f"{scene.revision[:16]}...", fix)
     if equivalent and scene.revision == revision:
         match = match_release(scene)
-        if match is None or not match.is_equivalent or match.revision != equivalent["revision"]:
+        if match is None or not match.is_equivalent or match.revision != equivalent[0]:
             found = next(iter(match.reasons), match.revision[:16]) if match else "no fingerprint to compare with"
-            expected = f"a scene that is equivalent to revision {equivalent['revision'][:16]}..."
+            expected = f"a scene that is equivalent to revision {equivalent[0][:16]}..."
             raise problem(scene.root, expected, found, "submit the record again, with its scenes")
 
 
@@ -214,13 +214,22 @@ def _wrong_sheets(leaderboard: Path, reading: Reading) -> Iterator[str]:
 
 
 def _scenes_of(entry: Entry, predictions: Path, scenes: Mapping[str, Path], allow_gaps: bool) -> list[Scene]:
-    """Return the scored scenes of an entry, opened; none unless all of them and their predictions are here."""
+    """Return the scored scenes of an entry, opened; none unless all are among those given, with its seed."""
     record = entry["record"]
     folder = predictions / record["method"]["name"]
     ok = [scene for scene, cell in record["scenes"].items() if cell["status"] == "ok"]
     if not ok or any(not (folder / scene / SUMS).is_file() or scene not in scenes for scene in ok):
         return []
-    return open_scenes([scenes[scene] for scene in ok], allow_gaps, record["dataset"]["split"])
+    if any(read_info(folder / scene).method.seed != record["method"]["seed"] for scene in ok):  # METHOD/ is of one seed
+        return []
+    opened = open_scenes([scenes[scene] for scene in ok], allow_gaps, record["dataset"]["split"])
+    return opened if all(scene.revision in _revisions(scene.id, record["dataset"]) for scene in opened) else []
+
+
+def _revisions(scene: str, dataset: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the revision of a record's scene, and the release's that it is equivalent to."""
+    equivalent = dataset.get("equivalent", {}).get(scene)
+    return dataset["scenes"][scene], *([equivalent["revision"]] if equivalent else [])
 
 
 def _once_a_scene(second_renderings: SecondRenderings) -> SecondRenderings:

@@ -37,7 +37,8 @@ def checks(
     yield partial(_check_seeds, season, seasons)
     yield partial(_check_results, season, seasons)
     for scene in season.scenes:
-        yield partial(_check_pack, scene, scenes)
+        yield partial(_check_pack, f"{scene.id}-training.tar", scene.training_pack_sha256, scenes)
+        yield partial(_check_pack, f"{scene.id}.tar", scene.pack_sha256, scenes)
         yield partial(_check_scene, scene, season, seasons, scenes)
     for path in sorted(result_path(seasons, season.season, "*").parent.glob("*.json")):
         yield partial(_check_scores, path.stem, season, seasons, scenes, predictions)
@@ -67,12 +68,12 @@ def _check_results(season: Season, seasons: Path) -> str:
     return f"ok: {len(results)} results are of the committed scenes, and the table follows from them"
 
 
-def _check_pack(scene: HiddenScene, scenes: Path | None) -> str:
-    path = None if scenes is None else scenes / f"{scene.id}.tar"
+def _check_pack(name: str, sha256: str, scenes: Path | None) -> str:
+    path = None if scenes is None else scenes / name
     if path is None or not path.is_file():
-        return f"not checked: {scene.id}.tar, whose sha256 is {scene.pack_sha256}"
-    if (found := sha256_file(path)) != scene.pack_sha256:
-        raise problem(path, f"sha256 {scene.pack_sha256}, as committed", found, _FORGED)
+        return f"not checked: {name}, whose sha256 is {sha256}"
+    if (found := sha256_file(path)) != sha256:
+        raise problem(path, f"sha256 {sha256}, as committed", found, _FORGED)
     return f"ok: {path} is the tar committed to"
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.video import video_writer
 from spike4dgs.benchmark.runs.cell import timed_fit
 from spike4dgs.benchmark.runs.display import RunDisplay
-from spike4dgs.benchmark.runs.predictions import MethodInfo
+from spike4dgs.benchmark.runs.predictions import INFO, MethodInfo
 from spike4dgs.benchmark.runs.provenance import Provenance, Savable
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.images.base import ImageMaker
@@ -64,6 +64,7 @@ def fit_recording(
     """
     console, times, seed = make_console(), dict[str, float](), request.seed
     with locked(out / ".lock", out, "a folder that no other fit uses"):
+        _check_folder(out)
         remove_parts(out)
         with _timed(times, "opening"):
             recording = open_recording(scene, seed)
@@ -109,6 +110,15 @@ def fit_recording(
     _say(console, f"model, sheet, video and report: {out}/{{{MODEL},{SHEET},{VIDEO},{REPORT}}}")
 
 
+def _check_folder(out: Path) -> None:
+    """Raise UserError for a folder of `run-benchmark`, whose predictions and checkpoints a fit's would replace."""
+    if (out / PREDICTIONS).exists() and not (out / PREDICTIONS / INFO).is_file():
+        fix = "choose another --out"
+        raise problem(
+            out / PREDICTIONS, "a new folder, or predictions of an earlier fit", "those of run-benchmark", fix
+        )
+
+
 def _scores(judged: HeldOutScores) -> str:
     """Return the scores of the held-out cameras in a line, or why there are none."""
     known = [m for m in SHOWN if judged.mean[m] is not None]
@@ -149,7 +159,9 @@ def _fitted(
     cameras = getattr(model, "cameras", ()) or about.cameras  # as the fit left them, where the model knows
     about = replace(about, cameras=cameras, fit_seconds=fit_seconds, created=utc_now())
     model.save(path, about)
-    shutil.rmtree(out / "work")
+    shutil.rmtree(work)
+    with suppress(OSError):  # it holds others' checkpoints
+        work.parent.rmdir()
     return SavedModel(model, about)
 
 

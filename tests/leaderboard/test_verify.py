@@ -186,6 +186,24 @@ def test_what_submit_writes_has_no_problems(
     assert "release 2, 2 entries, 1 scored again, no problems" in capsys.readouterr().out
 
 
+def test_entries_of_other_seeds_and_other_scenes_of_the_same_names_are_passed_over(
+    entered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They are honest, and what was given is not theirs."""
+    record = entered / "out/results/tfp+4dgs.json"
+    forged = json.loads(record.read_text())
+    for name, change in (
+        ("seed", lambda: forged["method"].update(seed=1)),
+        ("scene", lambda: forged["dataset"]["scenes"].update({"pattern-0": "0" * 64})),
+    ):
+        change()
+        (tmp_path / f"{name}.json").write_text(json.dumps(forged))
+        assert submit(tmp_path / f"{name}.json", leaderboard=entered / "board") == 0
+    assert not problems(entered, capsys, **files(entered))
+    assert verify_leaderboard(entered / "board", **files(entered)) == 0
+    assert "3 entries, 1 scored again" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -119,9 +119,12 @@ def source_seed(over: Made) -> None:
     write_manifest(over.root / "scenes" / SCENE)
 
 
-def tar(over: Made) -> None:
-    with open(over.root / "scenes" / f"{SCENE}.tar", "ab") as file:
-        file.write(b"0")
+def longer(name: str) -> Callable[[Made], None]:
+    def forge(over: Made) -> None:
+        with open(over.root / "scenes" / name, "ab") as file:
+            file.write(b"0")
+
+    return forge
 
 
 def value(over: Made) -> None:
@@ -170,7 +173,8 @@ FORGED: dict[str, tuple[Callable[[Made], None], str, str]] = {
         "scenes",
         "expected a training part of revision 0000",
     ),
-    "tar": (tar, "scenes", f"{SCENE}.tar: expected sha256"),
+    "tar": (longer(f"{SCENE}.tar"), "scenes", f"{SCENE}.tar: expected sha256"),
+    "training tar": (longer(f"{SCENE}-training.tar"), "scenes", f"{SCENE}-training.tar: expected sha256"),
     "value": (value, "runs", "as computed from the files"),
     "mean": (changed(COUNTS, lambda d: d["record"]["mean"].update(psnr=60.0)), "seasons", "the mean of its parts"),
     "other scenes": (

@@ -306,6 +306,18 @@ def test_what_cannot_be_done_is_said(
     assert "a folder that no other fit uses" in capsys.readouterr().err
 
 
+def test_the_folder_of_a_benchmark_is_refused(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A fit writes `predictions/` anew: those of methods and scenes in the same place would be gone."""
+    of_a_run = tmp_path / "predictions/tfp+4dgs/toy/SHA256SUMS"
+    of_a_run.parent.mkdir(parents=True)
+    of_a_run.touch()
+    assert main(["fit", str(recorded), "--out", str(tmp_path), *QUICK]) == 2
+    assert "predictions: expected a new folder" in capsys.readouterr().err
+    assert of_a_run.exists() and not (tmp_path / MODEL).exists()
+
+
 def test_a_killed_fit_resumes(
     recorded: Path, tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -322,8 +334,9 @@ def test_a_killed_fit_resumes(
     request = FitRequest(make_budget("0.02"), checkpoint=checkpoint)
     model = get_method("tfp+static").fit(open_scene(recorded).training, request)
     shutil.copy(checkpoint, clocks[0].parent)
+    shutil.copytree(clocks[0].parent, out / "work/another")
     assert main(arguments) == 0
-    assert "resuming after" in capsys.readouterr().out and not (out / "work").exists()
+    assert "resuming after" in capsys.readouterr().out and [p.name for p in (out / "work").iterdir()] == ["another"]
     camera = WORLD.held_out
     np.testing.assert_array_equal(load_model(out / MODEL).model.render(camera, 500.0), model.render(camera, 500.0))
 

@@ -244,14 +244,18 @@ def test_the_process_ends_with_its_caller_and_removes_the_part(small_scene: Path
 def test_a_fit_has_a_part_of_its_own_while_a_killed_fits_process_still_ends(small_scene: Path, tmp_path: Path) -> None:
     job, work = Job(CountMethod(), open_scene(small_scene), 0, "cpu", Budget()), tmp_path / "work"
     work.mkdir()
-    with _training_part(job, work) as killed, _training_part(job, work) as again:
+    with _training_part(job, work, Apart()) as killed, _training_part(job, work, Apart()) as again:
         assert not killed.exists(), "what killed fits left is removed"
         shutil.rmtree(killed, ignore_errors=True)  # what its process does at its end
         assert (again / "scene.json").is_file()
     assert files_in(work) == {}
 
 
-def test_the_part_is_on_the_disk_of_the_scene(small_scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("container", ["", "env"])
+def test_the_part_is_on_the_disk_of_the_scene_but_in_a_container(
+    small_scene: Path, tmp_path: Path, container: str
+) -> None:
+    """A container may hide the folder of the scenes: the part lies among the work, as copies."""
     other = Path("/dev/shm")
     if not other.is_dir() or other.stat().st_dev == small_scene.stat().st_dev:
         pytest.skip("no second disk here")
@@ -259,10 +263,13 @@ def test_the_part_is_on_the_disk_of_the_scene(small_scene: Path, tmp_path: Path)
     job = Job(LooksAround(seen), open_scene(small_scene), 0, "cpu", Budget())
     with tempfile.TemporaryDirectory(dir=other) as folder:
         out = Path(folder)
-        fit_apart(job, [out / "images"], out / "model", out / "work", lambda *a: steps.append(a), print)
+        fit_apart(
+            job, [out / "images"], out / "model", out / "work", lambda *a: steps.append(a), print, Apart(container)
+        )
         assert len(list((out / "images").rglob("*.exr"))) == 3 and not (out / "work").exists()
     found = json.loads(seen.read_text())
-    assert Path(found["folder"]).parent == small_scene.parent and found["names"]["spikes/cam_00.dat"] == 2
+    assert Path(found["folder"]).parent == (out / "work" if container else small_scene.parent)
+    assert found["names"]["spikes/cam_00.dat"] == (1 if container else 2)
     assert not list(small_scene.parent.glob(".spike4dgs-fit-*"))
     assert steps[-1] == (4, 4, "step 3"), "progress is passed on"
 
