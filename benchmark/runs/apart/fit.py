@@ -196,8 +196,8 @@ class _Child:
 def _training_part(job: Job, work: Path, apart: Apart) -> Iterator[Path]:
     """Write the training part and remove it at the end. It is on the scene's disk, where its files are links.
 
-    A container hides the scenes' folder, and so has it among the work, of whatever disk. Each has a folder of its own: the
-    process of a fit whose caller was killed may still be removing another.
+    A container hides the scenes' folder, and so has it among the work, of whatever disk. Each has a folder of its own:
+    the process of a fit whose caller was killed may still be removing another.
     """
     root, own = job.scene.root.absolute(), uuid4().hex[:16]
     for left in work.glob("part-*"):
