@@ -44,14 +44,14 @@ def test_all_is_right(over: Made, capsys: pytest.CaptureFixture[str]) -> None:
     assert checked(over) == 0
     shown = capsys.readouterr()
     assert not shown.err and "not checked" not in shown.out
-    assert len(shown.out.splitlines()) == shown.out.count("ok: ") == 2 + 2 * 2 + 2
+    assert len(shown.out.splitlines()) == shown.out.count("ok: ") == 2 + 2 * 3 + 2
 
 
 def test_public_files_alone_say_what_remains(over: Made, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     assert checked(over, scenes=None, predictions=None) == 0
     out = capsys.readouterr().out
-    assert out.count("ok: ") == 2 and out.count("not checked: ") == 6
+    assert out.count("ok: ") == 2 and out.count("not checked: ") == 8
     for seed in read_opening(over.public / OPENING_NAME).scenes:
         way = f"--profile tiny --variant 9003 --rendering paths --seed {seed.seed} --out"
         assert f"spike4dgs make-dataset {seed.world} {way}" in out
