@@ -9,9 +9,10 @@ that generalises over illumination". Its equations and code are not. All of the 
     L = (1 - w) mean |S - R| + w (1 - SSIM(S, R)) + v mean (a^2 + b^2),   S = mean_k s_k / gain, R: recorded
 
 Integrate-and-fire with subtractive reset is the camera's public model, and L1 with SSIM is 3DGS's loss. `gain` is the
-scene's spikes per tick of white, which a user knows, so that illumination needs no term of its own. The image is
-taken as constant for M ticks. v keeps the embedding from painting the image itself: every camera is fixed, so
-that a(x) alone could explain what it sees.
+scene's spikes per tick of white, which a user knows, so that illumination needs no term of its own; of a camera whose
+own gain differs, so many times as many, and of a sensor with dead ticks, the spikes that are left. The image is taken
+as constant for M ticks. v keeps the embedding from painting the image itself: every camera is fixed, so that a(x) alone
+could explain what it sees.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.sensor_model import fired
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.supervision.base import Render, Sample, Supervision, difference
@@ -48,6 +50,7 @@ class SpikeRender(Supervision):
         super().__init__()
         self.settings, self.scene = settings, scene
         first = scene.streams[0]
+        self.dead_ticks, self.gains = first.dead_ticks, [scene.state(c.id).gain for c in scene.cameras]
         self.noise = nn.Parameter(torch.zeros(len(scene.streams), 2, first.height, first.width))  # a and b
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
@@ -55,10 +58,12 @@ class SpikeRender(Supervision):
         s, gain = self.settings, self.scene.radiance_gain
         counts, ticks = recorded(self.scene, sample, s.spike_ticks)
         noise = self.noise[list(sample.views)]
-        rate = gain * (render(sample.t) * noise[:, 0].exp() + noise[:, 1])
+        light = render(sample.t) * noise[:, 0].exp() + noise[:, 1]
+        gains = light.new_tensor([self.gains[view] for view in sample.views])[:, None, None]
+        rate = fired(gain * light * gains, self.dead_ticks)
         unit = ticks * gain
-        fired = fire(rate, random_charge(rate, sample.step), ticks)
-        loss = difference(fired / unit, counts.to(rate) / unit, s.ssim_weight)
+        spikes = fire(rate, random_charge(rate, sample.step), ticks)
+        loss = difference(spikes / unit, counts.to(rate) / unit, s.ssim_weight)
         return loss + s.noise_weight * noise.square().mean()
 
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:

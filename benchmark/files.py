@@ -232,6 +232,11 @@ def _check_lock(file: Path) -> None:
 _PART = re.compile(r"\..+\.[0-9]+\.part(\.[^.]+)?")  # as in `atomic_path` and `SpikeWriter`
 
 
+def visible(folder: Path, pattern: str) -> list[Path]:
+    """Return a folder's files that fit a pattern, sorted, without hidden ones: those may be half written."""
+    return sorted(path for path in folder.glob(pattern) if not path.name.startswith("."))
+
+
 def remove_parts(folder: Path) -> None:
     """Remove what killed processes left half written in a folder and below it. The caller holds the folder's lock.
 

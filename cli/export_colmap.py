@@ -22,6 +22,7 @@ from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.scene.writer import write_colmap
 from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.cli.options import check_names
 
 _EVERY = 20  # ticks: 1 ms at 20 kHz
@@ -79,8 +80,8 @@ def _ticks(ticks: Sequence[int], every: int | None, n_ticks: int) -> list[int]:
 
 def _write_images(folder: Path, scene: Scene, camera: str, maker: str, ticks: Sequence[int]) -> list[str]:
     """Write a camera's images, and return their names in the model."""
-    stream, names = scene.stream(camera), []
-    seen = present(stream.gaps, stream.n_ticks)
+    stream, names = scene.stream(camera), list[str]()
+    seen, stream = present(stream.gaps, stream.n_ticks), fill_gaps(stream)
     for tick in (tick for tick in ticks if seen[tick]):
         names.append(f"{Target(camera, tick).name}.png")
         write_png(folder / names[-1], encode_srgb(IMAGES[maker](stream, [tick], scene.radiance_gain)[0]))

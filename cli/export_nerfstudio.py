@@ -29,6 +29,8 @@ from spike4dgs.benchmark.files import check_new, write_json
 from spike4dgs.benchmark.scene.cameras import Camera, distortion_px, to_nerfstudio
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.cli.options import check_names
 
 _TOLERANCE_PX = 0.005  # the most that one focal length and a principal point in the middle may move a pixel
@@ -67,7 +69,7 @@ def export_nerfstudio(
         split: Training and held-out cameras; the scene's default split if left out.
         colour: Test images in colour, where the ground truth has it. Spike cameras, and so the training images,
             see gray: compare with test images in gray.
-        allow_gaps: Accept a recording with gaps.
+        allow_gaps: Accept a recording with gaps. Images at missing ticks are left out.
     """
     opened = open_scene(scene, allow_gaps, split)
     check_names("--images", [images], IMAGES)
@@ -80,12 +82,16 @@ def export_nerfstudio(
     between = range(every // 2, opened.n_ticks, _VAL_EVERY * every)
     truth = opened.ground_truth_rgb if colour else opened.ground_truth
 
+    streams = {camera: opened.stream(camera) for camera in opened.train}
+    seen = {camera: present(stream.gaps, stream.n_ticks) for camera, stream in streams.items()}
+    filled = {camera: fill_gaps(stream) for camera, stream in streams.items()}
+
     def from_spikes(target: Target) -> Float32:
-        return IMAGES[images](opened.stream(target.camera), [target.tick], opened.radiance_gain)[0]
+        return IMAGES[images](filled[target.camera], [target.tick], opened.radiance_gain)[0]
 
     frames = {"test": [_write(out, "test", opened, target, truth(target)) for target in opened.targets]}
     for name, times in (("train", ticks), ("val", between)):
-        targets = [Target(camera, tick) for camera in opened.train for tick in times]
+        targets = [Target(camera, tick) for camera in opened.train for tick in times if seen[camera][tick]]
         frames[name] = [_write(out, name, opened, target, from_spikes(target)) for target in targets]
     for name, of_part in frames.items():  # after all images: what is cut off has no description
         path = out / f"transforms_{name}.json"

@@ -199,7 +199,8 @@ def inspect(
     """
     opened = open_streams(path, dat_file, allow_gaps)
     scene = opened if isinstance(opened, Scene) else None
-    streams = {camera: opened.stream(camera) for camera in opened.cameras} if isinstance(opened, Scene) else opened
+    # A training part has the poses of cameras whose streams it lacks.
+    streams = {c: opened.stream(c) for c in opened.meta["streams"]} if isinstance(opened, Scene) else opened
     if not path.is_dir():
         warn_of_size(streams)
     folder = out / (path.resolve().name if path.is_dir() else path.stem)

@@ -37,7 +37,7 @@ from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
-from spike4dgs.leaderboard.entry import typical_fit_seconds
+from spike4dgs.leaderboard.reading import typical_fit_seconds
 from spike4dgs.leaderboard.tracks import is_equivalent, release_line, track_scenes
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.record import Record
@@ -16,6 +17,13 @@ from spike4dgs.cli.submit import second_renderings_of
 from spike4dgs.leaderboard.submit import WORK, fit_again
 from spike4dgs.leaderboard.tracks import current_release
 from spike4dgs.leaderboard.verify import verify_leaderboard as check
+
+_NEEDS = {  # what an option does nothing without
+    "--predictions": ("--scenes",),
+    "--scenes": ("--predictions",),
+    "--refit": ("--predictions", "--scenes"),
+    "--container": ("--refit",),
+}
 
 
 def verify_leaderboard(
@@ -42,6 +50,12 @@ def verify_leaderboard(
         refit: Fit again what is labelled re-fitted.
         container: Command that starts the process of such a fit, as in `submit`.
     """
+    if predictions is not None and not predictions.is_dir():
+        raise problem(predictions, "a folder of predictions, METHOD/SCENE", "no such folder", "correct --predictions")
+    asked = {"--predictions": predictions, "--scenes": scenes, "--refit": refit, "--container": container}
+    for option, needed in _NEEDS.items():
+        if asked[option] and (lacks := [name for name in needed if not asked[name]]):
+            raise problem(option, f"{' and '.join(needed)} beside it", f"no {', '.join(lacks)}", "give all of them")
     release = current_release()
 
     def again(record: Record, opened: Sequence[Scene]) -> object:

@@ -31,7 +31,6 @@ from spike4dgs.benchmark.files import (
     json_object,
     locked,
     read_bytes,
-    read_json,
     sha256_json,
     write_bytes,
     write_json,
@@ -206,16 +205,6 @@ def entry_paths(leaderboard: Path, *folders: str) -> Iterator[str]:
                 yield name.as_posix()
 
 
-def typical_fit_seconds() -> dict[str, float]:
-    """Return the mean seconds of a fit by method in the shipped entries. Their machines differ: ratios count."""
-    times: dict[str, list[float]] = {}
-    for path in entry_paths(SHIPPED, PUBLIC):
-        record = read_json(SHIPPED / path, "an entry")["record"]
-        known = [cell["fit_seconds"] for cell in record["scenes"].values() if cell["fit_seconds"] is not None]
-        times.setdefault(record["method"]["name"], []).extend(known)
-    return {method: sum(known) / len(known) for method, known in times.items() if known}
-
-
 def write_entry(
     leaderboard: Path,
     record: Record,
@@ -225,9 +214,9 @@ def write_entry(
 ) -> Entry:
     """Write a record's entry, or keep the one that makes the same claim; return the entry in the leaderboard.
 
-    An entry that makes the same claim takes over a better verification, and thumbnails if its own are missing or
-    with `replace`. The caller holds the leaderboard's lock. Raises UserError where the method has another record there,
-    unless `replace`, and where another method's name differs by case alone.
+    An entry that makes the same claim takes over a better verification, and thumbnails if its own are missing; with
+    `replace` others of both. The caller holds the leaderboard's lock. Raises UserError where the method has another
+    record there, unless `replace`, and where another method's name differs by case alone.
     """
     name = entry_path(record)
     path = leaderboard / name
@@ -245,7 +234,8 @@ def write_entry(
                 raise
         else:
             if _claim(old["record"]) == _claim(record):
-                better = _confidence(entry) > _confidence(old)
+                now, before = _confidence(entry), _confidence(old)
+                better = now > before or (replace and now == before and _found(entry) != _found(old))
                 if has_sheet(path, old) and not replace:
                     thumbnails = None
                 if not better and thumbnails is None:
@@ -256,8 +246,7 @@ def write_entry(
                 raise problem(path, "no entry of this method, or the same record", "another record", fix)
     if thumbnails:
         entry = {**entry, KEY: thumbnails.stated}
-    # First the ledger and the sheet: a process that is killed in between leaves a line or a sheet too many, never an
-    # entry without one.
+    # First ledger and sheet: a process killed in between leaves a line or a sheet too many, never an entry without one.
     add_line(leaderboard, sha256_json(entry), name)
     if thumbnails:
         write_bytes(sheet_path(path), thumbnails.sheet)
@@ -269,8 +258,7 @@ def write_entry(
 
 def lock(leaderboard: Path) -> Any:
     """Return the leaderboard's lock, a context manager that waits for other submissions."""
-    expected = "a leaderboard that other submissions leave in time"
-    return locked(leaderboard / ".lock", leaderboard, expected, WAIT_S)
+    return locked(leaderboard / ".lock", leaderboard, "a leaderboard that other submissions leave in time", WAIT_S)
 
 
 def remove_parts(leaderboard: Path) -> None:
@@ -290,6 +278,10 @@ def _confidence(entry: Entry) -> tuple[int, int, int]:
     v = entry["verification"]
     measured = sum(t["noise_share"] is not None for t in v["truth"].values())
     return LABELS.index(v["label"]), -len(v["unverified"]), measured
+
+
+def _found(entry: Entry) -> dict[str, Any]:
+    return {key: value for key, value in entry["verification"].items() if key != "by"}
 
 
 def _claim(record: Mapping[str, Any]) -> str:

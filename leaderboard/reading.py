@@ -18,7 +18,7 @@ from typing import Any
 
 from spike4dgs.benchmark import schemas
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import read_bytes, user_cache, write_bytes
+from spike4dgs.benchmark.files import read_bytes, read_json, user_cache, write_bytes
 from spike4dgs.benchmark.metrics.table import PRIMARY
 from spike4dgs.benchmark.runs.record import with_later_metrics
 from spike4dgs.leaderboard import tracks
@@ -166,3 +166,13 @@ def _code_of(release: Path) -> str:
             digest.update(path.read_bytes())
     digest.update(release.read_bytes())
     return digest.hexdigest()
+
+
+def typical_fit_seconds() -> dict[str, float]:
+    """Return the mean seconds of a fit by method in the shipped entries. Their machines differ: ratios count."""
+    times: dict[str, list[float]] = {}
+    for path in entry_paths(tracks.SHIPPED, tracks.PUBLIC):
+        record = read_json(tracks.SHIPPED / path, "an entry")["record"]
+        known = [cell["fit_seconds"] for cell in record["scenes"].values() if cell["fit_seconds"] is not None]
+        times.setdefault(record["method"]["name"], []).extend(known)
+    return {method: sum(known) / len(known) for method, known in times.items() if known}

@@ -215,7 +215,7 @@ def fit_radiance_field(job: FitJob) -> RadianceModel:
     """
     fitter = Fitter(job)
     fitter.run()
-    return RadianceModel(fitter.field, job.scene.duration_us, job.request.device)
+    return RadianceModel(fitter.field, job.scene.duration_us, job.request.device, tuple(job.start.cameras))
 
 
 SETTINGS = {

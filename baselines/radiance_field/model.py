@@ -184,6 +184,7 @@ class RadianceModel(Shown):
     field: DynamicField
     duration_us: float
     device: str
+    cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit had them; not saved
 
     def _about(self) -> str:
         return f"radiance field: {self.size_bytes / 1e6:.1f} MB, {self.duration_us / 1e3:.6g} ms, on {self.device}"

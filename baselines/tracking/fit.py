@@ -141,7 +141,7 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
         tracker.restore(saved)
     with one_torch_thread():
         tracker.run(checkpoint_s)
-    return TrackedModel(gaussians, tracker.tracks, job.scene.duration_us)
+    return TrackedModel(gaussians, tracker.tracks, job.scene.duration_us, tuple(job.start.cameras))
 
 
 def first_index(job: FitJob) -> int:

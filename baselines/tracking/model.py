@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.runs.provenance import Provenance
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.fitted_model import GaussianModel, count_bytes
 from spike4dgs.method.models.model_file import ModelFile, group, write_model
@@ -98,6 +99,7 @@ class TrackedModel(GaussianModel):
     gaussians: Gaussians
     tracks: Tracks
     duration_us: float
+    cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit had them; not saved
 
     @property
     def device(self) -> str:  # type: ignore[override]

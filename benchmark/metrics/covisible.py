@@ -25,12 +25,12 @@ _SKY_M = 1e6  # where a pixel without a surface is put,
 _FAR_M = 1e4  # and the depth above which all count as equal: the axes of two cameras differ
 
 
-def covisible(scene: Scene) -> dict[str, Mask]:
+def covisible(scene: Scene) -> dict[str, Mask] | None:
     """Return, by held-out camera, the pixels [H, W] whose resting surface at least two training cameras see.
 
-    A camera's resting scene is the farthest that it sees at any instant: what moves hides it for a time. Nothing is
-    returned for a scene without depth of all these cameras at some instant, such as a recording, or with files of it
-    that cannot be read.
+    A camera's resting scene is the farthest that it sees at any instant: what moves hides it for a time. A scene
+    without depth of all these cameras at some instant, such as a recording, has none; None where files of it cannot be
+    read.
     """
     cameras = (*scene.train, *scene.test)
     found = [match.groups() for match in map(_DEPTH.fullmatch, scene.manifest.files) if match]
@@ -40,7 +40,7 @@ def covisible(scene: Scene) -> dict[str, Mask]:
     try:
         depth = {camera: _resting_depth(scene, camera, sorted(ticks)) for camera in cameras}
     except UserError:  # no other metric needs them
-        return {}
+        return None
     seen_by = {scene.cameras[camera]: depth[camera] for camera in scene.train}
     return {camera: count_views(scene.cameras[camera], depth[camera], seen_by) >= CAMERAS for camera in scene.test}
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.arrays import Float64, Mask
 from spike4dgs.benchmark.scene.calibration import Recordings, estimate
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings
-from spike4dgs.benchmark.spikes.sensor_model import SENSOR
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR, fired
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.times import Spans, is_recorded, spans_around
 
@@ -39,11 +39,19 @@ def log_probability(intervals: Float64, ticks: Float64, rate: Float64, tolerance
     return _log_mean_triangle((rate * ticks / intervals - 1) * ticks, spread)
 
 
+_WIDE = 1e4  # a spread beside which the triangle is a point: of the second difference below nothing would be left
+
+
 def _log_mean_triangle(d: Float64, s: Float64) -> Float64:
-    """Return log E tri(d + s Z). All three terms are taken on the side where they are small: nothing cancels there."""
-    side = -np.abs(d)
-    a, b, c = (_log_h((side + x) / s) for x in (1, 0, -1))
-    return np.asarray(np.log(s) + a + np.log1p(np.exp(c - a) - 2 * np.exp(b - a)))
+    """Return log E tri(d + s Z). All three terms are taken on the side where they are small: nothing cancels there.
+
+    They differ by parts of 1 / s^2. Where that is no more, the triangle has the area 1 at one place.
+    """
+    wide = s > _WIDE
+    near, side = np.where(wide, 1.0, s), np.where(wide, 0.0, -np.abs(d))
+    a, b, c = (_log_h((side + x) / near) for x in (1, 0, -1))
+    exact = np.log(near) + a + np.log1p(np.exp(c - a) - 2 * np.exp(b - a))
+    return np.asarray(np.where(wide, -((d / s) ** 2) / 2 - np.log(s) - np.log(2 * np.pi) / 2, exact))
 
 
 def _log_h(u: Float64) -> Float64:
@@ -93,24 +101,28 @@ SPAN_WINDOW = 20  # ticks that the judged intervals cover
 class Response:
     """A camera's response to light, as its recordings of light and darkness tell."""
 
-    white: Float64  # [H, W] spikes per tick that a pixel adds under radiance 1
-    dark: Float64  # [H, W] spikes per tick in the dark
+    white: Float64  # [H, W] charge per tick that a pixel adds under radiance 1, in spikes
+    dark: Float64  # [H, W] charge per tick in the dark
     unit: float  # spikes per tick of white of the whole array, the unit of errors
     good: Mask  # [H, W] neither dead nor hot
+    dead_ticks: float = 0.0  # after a spike, in which a pixel gathers nothing
 
     def rate(self, radiance: Float64) -> Float64:
         """Return the spikes per tick under radiance in [0, 1]: at most one a tick."""
-        return np.minimum(self.white * radiance + self.dark, 1.0)
+        return np.asarray(np.minimum(fired(self.white * radiance + self.dark, self.dead_ticks), 1.0))
 
 
-def response_of(recordings: Recordings | None, shape: tuple[int, int], radiance_gain: float) -> Response:
+def response_of(
+    recordings: Recordings | None, shape: tuple[int, int], radiance_gain: float, dead_ticks: float = 0.0
+) -> Response:
     """Return a camera's response; without recordings all pixels have the gain 1 and no dark rate, and none is bad."""
+    unit = float(fired(radiance_gain, dead_ticks))
     if recordings is None:
         ones = np.ones(shape)
-        return Response(radiance_gain * ones, 0 * ones, radiance_gain, np.ones(shape, np.bool_))
+        return Response(radiance_gain * ones, 0 * ones, unit, np.ones(shape, np.bool_), dead_ticks)
     found, bad = estimate(recordings), from_recordings(recordings.flat, recordings.dark)
     white, dark = radiance_gain * found.gain.astype(np.float64), found.dark.astype(np.float64)
-    return Response(white, dark, radiance_gain, ~(bad.dead | bad.hot))
+    return Response(white, dark, unit, ~(bad.dead | bad.hot), dead_ticks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,6 +73,7 @@ def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int, flat: 
     """
     if twice := [s.id for i, s in enumerate(scenes) if s.id in [other.id for other in scenes[:i]]]:
         raise problem(scenes[0].root, "scenes of different ids", f"{twice[0]} twice", "name each scene once")
+    out = out.absolute()  # `.` has no name
     with locked(out.with_name(f".{out.name}.lock"), out, "a folder that no other program packs into"):
         scenes = [_with_counts(scene, out / _COUNTED / scene.id) for scene in scenes]
         samples = [sample for scene in scenes for sample in _samples(scene)]

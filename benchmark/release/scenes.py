@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import locked, read_json, sha256_file, write_json, writing
+from spike4dgs.benchmark.files import locked, read_json, sha256_file, visible, write_json, writing
 from spike4dgs.benchmark.release import index
 from spike4dgs.benchmark.release.index import Member, Release, SceneEntry, Shard, parse_release, parse_shard
 from spike4dgs.benchmark.release.selection import Selection
@@ -159,7 +159,7 @@ class _Download:
             wanted = [w for w in wanted if not w.path.is_file()]
         transfer(self.source, wanted, self.progress, self.workers)
         streams = {}
-        for path in sorted(root.glob("*.dat")):
+        for path in visible(root, "*.dat"):
             size, order, gaps = (scene.width, scene.height), scene.rows_bottom_up, _gaps_in(scene, path.stem, ticks)
             streams[path.stem] = open_stream(
                 path, *size, scene.rate_hz, rows_bottom_up=order, n_ticks=len(ticks), gaps=gaps

@@ -133,7 +133,9 @@ def blocks_of(
         rows = [_Row(name, [cell["metrics"] for cell in cells], cells) for name, cells in named if cells]
         blocks.append(_block(scene, metrics, costs, rows))
     if len(scenes) > 1:
-        means = [_Row(m[0]["method"]["name"], [r["mean"] for r in m], cells_of(m)) for m in methods]
+        # Means over fewer scenes are not beside them.
+        whole = [[r for r in m if set(scenes) <= r["scenes"].keys()] for m in methods]
+        means = [_Row(m[0]["method"]["name"], [r["mean"] for r in m], cells_of(m)) for m in whole if m]
         blocks.append(_block(f"mean of {len(scenes)} scenes", metrics, costs, means))
     return metrics, costs, blocks
 

@@ -75,8 +75,9 @@ def open_cameras(scene: Scene, targets: Sequence[Target], selection: Selection) 
     for name in dict.fromkeys(t.camera for t in targets):
         camera = scene.cameras[name]
         try:
-            response = response_of(scene.recordings(name), (camera.height, camera.width), scene.radiance_gain)
-            cameras[name] = HeldOutCamera(scene.stream(name), response)
+            stream, size = scene.stream(name), (camera.height, camera.width)
+            response = response_of(scene.recordings(name), size, scene.radiance_gain, stream.dead_ticks)
+            cameras[name] = HeldOutCamera(stream, response)
         except UserError:  # the message has a path of this machine, and records travel
             return {}, selection.without(SPIKE_METRICS, f"the stream or the recordings of {name} cannot be read")
     return cameras, selection

@@ -232,7 +232,7 @@ def write_predictions(
         images = {t: render(scene.cameras[t.camera], scene.t_us(t.tick)) for t in scene.targets}
         write_predictions("runs/mine", scene, images, "my-method")
     """
-    root, opened = Path(root), scene if isinstance(scene, Scene) else open_scene(scene)
+    root, opened = Path(root).absolute(), scene if isinstance(scene, Scene) else open_scene(scene)
     if root.exists() and not (root / INFO).is_file():
         raise problem(root, "a new folder, or earlier predictions", "something else", "choose another folder")
     fix = "give an image for each of scene.targets"

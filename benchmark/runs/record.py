@@ -131,8 +131,8 @@ def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str
 def with_earlier_scenes(record: Record, path: Path) -> Record:
     """Return a record with the cells of further scenes that the record at `path` has of the same method and split.
 
-    A record of another version, seed or other parameters, one with another protocol, and a file that is none are
-    without effect.
+    A record of another version, seed, budget or other parameters, one with another protocol, and a file that is none
+    are without effect.
     """
     try:
         earlier = read_record(path)
@@ -140,6 +140,8 @@ def with_earlier_scenes(record: Record, path: Path) -> Record:
         return record
     same = all(earlier[key] == record[key] for key in ("method", "protocol"))
     same = same and earlier["harness"]["version"] == record["harness"]["version"]
+    budgets = {cell["budget"] for r in (earlier, record) for cell in r["scenes"].values() if cell["status"] == "ok"}
+    same = same and len(budgets) <= 1
     added = {scene: cell for scene, cell in earlier["scenes"].items() if scene not in record["scenes"]}
     if not same or not added or earlier["dataset"]["split"] != record["dataset"]["split"]:
         return record

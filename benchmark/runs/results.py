@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import write_text
+from spike4dgs.benchmark.files import visible, write_text
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.record import COSTS, Record, read_record
@@ -77,7 +77,7 @@ def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Recor
     """
     names, dataset = {r["method"]["name"] for r in records}, records[0]["dataset"]
     found, left_out = [], []
-    for path in sorted([*folder.glob("results/*.json"), *folder.glob("seed-*/results/*.json")]):
+    for path in [*visible(folder, "results/*.json"), *visible(folder, "seed-*/results/*.json")]:
         if path.stem in names:
             continue
         try:

@@ -35,6 +35,8 @@ def score_scene(predictions: Predictions, scene: Scene, selection: Selection, wi
     if compare:
         gain = fit_gain((p.truth_radiance, p.predicted_radiance) for _, p in _pairs(predictions, scene, {}, True))
     masks = covisible(scene) if compare else {}
+    if masks is None:
+        masks, selection = {}, selection.without(("psnr_covisible",), "the scene's depth cannot be read")
     measured = {
         t.name: measure(replace(pair, covisible=masks.get(t.camera)), gain, selection.metrics)
         for t, pair in _pairs(predictions, scene, cameras, compare)

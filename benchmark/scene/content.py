@@ -112,6 +112,8 @@ def revision_of(
             "radiance_gain": float(meta["radiance_gain"]),
             "size": [int(meta["width"]), int(meta["height"])],
             "rows_bottom_up": bool(meta["sensor"]["rows_bottom_up"]),
+            # Older scenes have no such key, and no dead ticks.
+            **({"dead_ticks": float(dead)} if (dead := meta["sensor"].get("dead_ticks", 0)) else {}),
             "gaps": gaps,
             "cameras": _rounded(cameras),
             "splits": meta["splits"],

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -75,7 +75,7 @@ class CountedRecording:
     def taken(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> CountedRecording:
         """Return the recording whose pixel [i, j] has the spikes of pixel (y[i, j], x[i, j])."""
         first, last, total = (image[y, x] for image in (self.first, self.last, self.total))
-        return CountedRecording(first, last, total, self.windows[:, y, x], self.n_ticks, self.source)
+        return replace(self, first=first, last=last, total=total, windows=self.windows[:, y, x])
 
 
 Recording: TypeAlias = SpikeStream | CountedRecording
@@ -90,7 +90,7 @@ def counted(recording: Recording) -> CountedRecording:
     for window, start in zip(windows, starts, strict=True):
         window[:] = recording.counts(start, start + WINDOW_TICKS)
     first, last, total = (image.astype(np.int32) for image in first_last_total(recording))
-    return CountedRecording(first, last, total, windows, recording.n_ticks, recording.source)
+    return CountedRecording(first, last, total, windows, recording.n_ticks, recording.source, recording.dead_ticks)
 
 
 def first_last_total(recording: Recording) -> tuple[Int64, Int64, Int64]:

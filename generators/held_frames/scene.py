@@ -67,14 +67,15 @@ class Holding:
     def check(self, footage: Mapping[str, Footage]) -> None:
         """Raise UserError for a camera that is not there and for numbers that the footage does not allow."""
         first = next(iter(footage.values()))
+        frames = len(range(0, first.frames, max(1, self.every)))
         if self.held_out not in footage or len(footage) < 3:
             expected = "one of at least three cameras"
             raise problem("--held-out", expected, f"{self.held_out}, of {', '.join(footage)}", "name one of them")
         for name, value, least, most in (
-            ("--width", self.width or first.width, 8, first.width),
+            ("--width", first.width if self.width is None else self.width, 8, first.width),
             ("--hold-ticks", self.hold_ticks, _FEWEST_TICKS, _MOST_TICKS),
             ("--every", self.every, 1, first.frames),
-            ("--instants", self.instants or 1, 1, len(range(0, first.frames, max(1, self.every)))),
+            ("--instants", 1 if self.instants is None else self.instants, 1, frames),
         ):
             if not least <= value <= most:
                 raise problem(name, f"{least} to {most}", str(value), "correct it")

@@ -109,7 +109,11 @@ def _finish_scene(out: Path, profile: RigProfile, record: ClipRecord) -> None:
             n_ticks=record.n_ticks,
             radiance_gain=profile.radiance_gain,
             targets=record.targets,
-            sensor={"model": profile.sensor, "rows_bottom_up": True},
+            sensor={
+                "model": profile.sensor,
+                "rows_bottom_up": True,
+                **({"dead_ticks": profile.dead_ticks} if profile.dead_ticks else {}),
+            },
             source=_source(profile, record),
             clock=_clock(record),
             sync=_sync(record),

@@ -61,6 +61,7 @@ _RIG: dict[str, Kind[Any]] = {
     "licence": TEXT,
     "sensor": TEXT,
     "radiance_gain": number(0, 1, "a number above 0, 1 at most"),
+    "dead_ticks": values("a number from 0 to 100", lambda v: type(v) in (int, float) and 0 <= v <= 100, float),
     "held_out": tuple_of(_ID, "a list of cameras"),
 }
 _TRANSFER: dict[str, Kind[Any]] = {
@@ -128,6 +129,7 @@ class RigProfile:
     licence: str = "unknown"
     sensor: str = "unknown"  # sensor.model of scene.json
     radiance_gain: float = 1.0  # spikes per tick of a pixel that sees white
+    dead_ticks: float = 0.0  # after each spike, in which a pixel gathers no light
     held_out: tuple[str, ...] = ()  # cameras that recordings hold out for testing
     transfer_bytes: int = 262144  # of one bulk read
     transfers: int = 16  # reads in flight per camera

@@ -198,6 +198,9 @@ def light_truth(light: Light, profile: RigProfile) -> Truth:
         if not names <= streams.keys() or {k[:2] for k in kinds} != {(profile.width, profile.height)} or len(kinds) > 1:
             found = f"{', '.join(streams)} of {', '.join(f'{k[0]}x{k[1]}' for k in kinds)}"
             raise problem(folder, f"recordings of one length by the cameras of {profile.name}", found, "record them")
-        facts[f"{mode}_ticks"] = kinds.pop()[2]
+        _, _, facts[f"{mode}_ticks"], rows_bottom_up = kinds.pop()
+        if not rows_bottom_up:  # files are copied as they are
+            fix = "record them with `record`, or turn their rows over"
+            raise problem(folder, "the bottom row first, as in a scene", "the top row first", fix)
         files |= {f"calibration/{mode}/{name}.dat": Path(streams[name].source) for name in sorted(names)}
     return Truth(extras={"calibration": facts}, files=files)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import visible
 from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
 from spike4dgs.leaderboard.entry import Entry
@@ -107,16 +108,25 @@ def gather(
     if published and leaderboard.resolve() != SHIPPED.resolve():
         _add_published(boards, brief)
     for run in runs:
-        for records in seeds_of_methods(run_records(run)):
-            for board in _boards_of(boards, records[0]):
-                _add_run(board, run, records)
+        for of_method in seeds_of_methods(run_records(run)):
+            for records in _by_dataset(of_method):
+                for board in _boards_of(boards, records[0]):
+                    _add_run(board, run, records)
     order = (PUBLIC, LOCAL, ARCHIVE)
     return sorted(boards, key=lambda b: order.index(b.folder)), refused
 
 
+def _by_dataset(records: Sequence[Record]) -> list[list[Record]]:
+    """Return records in groups of the same scenes and split: of a killed run some seeds have fewer scenes."""
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(dataset_revision(on_release(record["dataset"])), []).append(record)
+    return list(groups.values())
+
+
 def run_records(run: Path) -> list[Record]:
     """Return the records of a finished run, of all seeds. Raises UserError where there is none."""
-    paths = sorted([*run.glob("results/*.json"), *run.glob("seed-*/results/*.json")])
+    paths = [*visible(run, "results/*.json"), *visible(run, "seed-*/results/*.json")]
     if not paths:
         raise problem(run, "a folder of run-benchmark with results/*.json", "none", "check the path of --runs")
     return [read_record(path) for path in paths]

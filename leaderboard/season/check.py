@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.files import sha256_file, visible
 from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.scene.verify import verify_content
@@ -40,7 +40,7 @@ def checks(
         yield partial(_check_pack, f"{scene.id}-training.tar", scene.training_pack_sha256, scenes)
         yield partial(_check_pack, f"{scene.id}.tar", scene.pack_sha256, scenes)
         yield partial(_check_scene, scene, season, seasons, scenes)
-    for path in sorted(result_path(seasons, season.season, "*").parent.glob("*.json")):
+    for path in visible(result_path(seasons, season.season, "*").parent, "*.json"):
         yield partial(_check_scores, path.stem, season, seasons, scenes, predictions)
 
 
@@ -119,7 +119,8 @@ def _open_checked(folder: Path, scene: HiddenScene, season: Season) -> Scene:
 
 def _check_scores(name: str, season: Season, seasons: Path, scenes: Path | None, predictions: Path | None) -> str:
     path = result_path(seasons, season.season, name)
-    if scenes is None or predictions is None or not (predictions / name).is_dir():
+    there = scenes is not None and all((scenes / scene.id).is_dir() for scene in season.scenes)
+    if scenes is None or not there or predictions is None or not (predictions / name).is_dir():
         return f"not checked: the scores of {name}, which take --scenes and --predictions with {name}/"
     opened = [open_scene(scenes / scene.id) for scene in season.scenes]
     record, given = read_result(path).record, predictions / name

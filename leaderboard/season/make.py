@@ -50,7 +50,7 @@ def make_season(
     commitments are new: those of a season are never changed, and a killed run goes on with its seeds. Raises UserError
     for bad arguments, and where `secret` is another season's.
     """
-    _check(number, worlds, closes)
+    _check(number, worlds, closes, fit_seed)
     make_budget(budget)
     with locked(secret / ".lock", secret, "a folder in which nobody else makes a season"):
         drawn = _opening(number, worlds, profile, rendering, secret)
@@ -81,13 +81,16 @@ def make_season(
     return True
 
 
-def _check(number: int, worlds: Sequence[str], closes: str | None) -> None:
+def _check(number: int, worlds: Sequence[str], closes: str | None, fit_seed: int) -> None:
     if number < 0:
         raise problem("number", "a number from 0 up", str(number), "correct it")
+    if fit_seed < 0:
+        raise problem("--fit-seed", "a number from 0 up", str(fit_seed), "correct it")
     if not worlds or len(set(worlds)) < len(worlds):
         raise problem("--worlds", "worlds, each once", " ".join(worlds) or "none", "see `spike4dgs worlds`")
     try:
-        date.fromisoformat(closes or "2000-01-01")
+        if closes and date.fromisoformat(closes).isoformat() != closes:  # Python reads 20270131 too
+            raise ValueError
     except ValueError:
         raise problem("--closes", "a day such as 2027-01-31", repr(closes), "correct it") from None
 

@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import locked, read_json, remove_parts, write_json, write_text
+from spike4dgs.benchmark.files import locked, read_json, remove_parts, visible, write_json, write_text
 from spike4dgs.benchmark.method import Method, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
@@ -87,7 +87,7 @@ def write_result(seasons: Path, number: int, result: Result) -> None:
     """
     path = result_path(seasons, number, result.name)
     check_no_oracle(result.record, path)
-    for other in path.parent.glob("*.json"):
+    for other in visible(path.parent, "*.json"):
         if other.stem != result.name and _alike(other.stem) == _alike(result.name):
             fix = "a name is scored once in a season, however it is written: submit under another one"
             raise problem(path, "a name that differs in letters or digits", other.stem, fix)
@@ -124,7 +124,7 @@ def read_results(seasons: Path, season: Season) -> list[Result]:
     """
     found = []
     expected = {scene.id: scene.revision for scene in season.scenes}
-    for path in sorted((season_folder(seasons, season.season) / "results").glob("*.json")):
+    for path in visible(season_folder(seasons, season.season) / "results", "*.json"):
         result = read_result(path)
         if (scenes := result.record["dataset"]["scenes"]) != expected:
             raise problem(path, f"scores of the committed {json.dumps(expected)}", json.dumps(scenes), "score it again")

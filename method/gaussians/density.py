@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import RenderOutput
@@ -25,6 +26,11 @@ class DensitySettings(Settings):
     max_per_pixel: float = 0.8  # Gaussians per pixel of one view; 0.5 costs 0.6 dB and saves a fifth of the time
     max_moving_per_pixel: float = 0.4  # the same of those before a background, which is not counted
     max_gaussians: int = 1_000_000  # whatever the images' size; half as many before a background
+
+    def __post_init__(self) -> None:
+        if self.refine_every < 1:
+            fix = "refine_stop=0 never changes the density"
+            raise problem("settings of density", "refine_every of 1 step or more", str(self.refine_every), fix)
 
     def due(self, done: int, steps: int) -> bool:
         """Return whether the density changes after `done` of a stage's `steps`."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam as torch_adam
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -21,6 +22,10 @@ class Decay:
 
     first: float
     last: float
+
+    def __post_init__(self) -> None:
+        if not min(self.first, self.last) > 0:
+            raise problem("settings", "learning rates above 0", f"{self.first:g} to {self.last:g}", "correct them")
 
     def at(self, fraction: float) -> float:
         """Return the learning rate after `fraction` in [0, 1] of the stage."""

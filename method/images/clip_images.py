@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.reports.video import video_writer
 from spike4dgs.benchmark.scene.images import encode_srgb, read_png, write_exr, write_png
 from spike4dgs.benchmark.spikes.gaps import present
+from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.base import ImageMaker
 
@@ -79,6 +80,7 @@ class ClipImages:
             "height": s.height,
             "rate_hz": s.rate_hz,
             "rows_bottom_up": s.rows_bottom_up,
+            **({"gaps": "filled"} if s.gaps else {}),
         }
 
 
@@ -99,7 +101,8 @@ def write_clip_images(out: Path, wanted: ClipImages) -> bool:
         raise problem(
             wanted.stream.source, "a tick with data among those of the images", "none", "choose another --every"
         )
-    s = wanted.stream
+    s = fill_gaps(wanted.stream)  # as a fit has it: lost ticks are no dark
+    wanted = replace(wanted, stream=s)
     wanted.maker(s, ticks[:1], wanted.gain)  # a maker that lacks something says so before anything is written
     write_json(folder / _NAME, {**facts, "complete": False})
     with video_writer(video, (s.width + s.width % 2, s.height + s.height % 2), wanted.fps) as write:

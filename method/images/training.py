@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from spike4dgs.benchmark.arrays import Float32, Half
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.camera_state import Clock, local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -33,6 +34,12 @@ class ImageSettings(Settings):
     edge_ticks: int = 10  # windows nearer to the clip's ends are cut, and their images belong to a later time
     max_times: int = 256  # bounds memory: 256 times x 8 views of 250x400 are 0.8 GB
     flat_field: bool = False  # correct the images by each camera's calibrated gain n(x, y) and dark rate, if known
+
+    def __post_init__(self) -> None:
+        if self.time_spacing_ticks < 1 or self.max_times < 1 or self.edge_ticks < 0:
+            expected = "time_spacing_ticks and max_times of 1 or more, edge_ticks of 0 or more"
+            found = f"{self.time_spacing_ticks}, {self.max_times} and {self.edge_ticks}"
+            raise problem("settings of images", expected, found, "correct them")
 
     def denser(self, pace: float) -> Self:
         """Return settings with so many times as many images."""

@@ -16,6 +16,7 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
+from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
 
 Path = Callable[[float], Camera]
 PathName = Literal["orbit", "rig", "still"]
@@ -88,7 +89,9 @@ def rig(cameras: Sequence[Camera]) -> Path:
         R = Slerp([0.0, 1.0], turns[[i, min(i + 1, len(stops) - 1)]])(w).as_matrix()
         values = {k: (1 - w) * getattr(a, k) + w * getattr(b, k) for k in ("fx", "fy", "cx", "cy")}
         center = (1 - w) * a.center + w * b.center
-        return replace(stops[0], id="rig", R=R, t=-R @ center, **values)
+        lenses = [np.array(c.distortion or [0.0] * len(NAMES)) for c in (a, b)]
+        lens = make_distortion(((1 - w) * lenses[0] + w * lenses[1]).tolist())
+        return replace(stops[0], id="rig", R=R, t=-R @ center, distortion=lens, **values)
 
     return at
 

@@ -16,6 +16,7 @@ from spike4dgs.benchmark.reports.error_map import error_image
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.method.models.saved_model import SavedModel
 
 Mode = Literal["rendered", "spike rate", "error"]
@@ -51,7 +52,9 @@ class Content:
         return error_image(self.saved.model.render(camera, t_us), recorded)
 
     def spike_rate(self, camera: str, t_us: float) -> Float32:
-        """Return the spikes per tick in the window around `t_us` over the radiance gain: [H, W], 1.0 = white.
+        """Return the light by the spikes in the window around `t_us`: their rate over the radiance gain, [H, W].
+
+        1.0 = white; ticks in which the sensor gathers no light are counted out.
 
         Raises UserError if there is no scene, or if it has no such training camera.
         """
@@ -61,8 +64,9 @@ class Content:
             known = ", ".join(names) or "none: no scene is given"
             raise problem("camera", f"a training camera of the scene ({known})", repr(camera), "choose one of them")
         start, stop = window(scene.tick(t_us), scene.n_ticks)
-        counts = scene.streams[names.index(camera)].counts(start, stop)
-        return (counts / ((stop - start) * scene.radiance_gain)).astype(np.float32)
+        stream, ticks = scene.streams[names.index(camera)], stop - start
+        charge = gathered(stream.counts(start, stop), stream.dead_ticks / ticks)  # of the window
+        return (charge / (ticks * scene.radiance_gain)).astype(np.float32)
 
 
 def window(tick: int, n_ticks: int) -> tuple[int, int]:

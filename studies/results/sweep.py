@@ -25,7 +25,7 @@ from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
 from spike4dgs.benchmark.runs.run import JobFiles, Settings, check_inputs, run_cells
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.leaderboard.entry import typical_fit_seconds
+from spike4dgs.leaderboard.reading import typical_fit_seconds
 from spike4dgs.studies.results.code_state import CodeState, code_digest
 from spike4dgs.studies.results.plan import Cell, knowledge_of
 from spike4dgs.studies.results.records import (

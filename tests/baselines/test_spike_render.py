@@ -10,6 +10,8 @@ from toy_world import GAIN, ToyWorld, run_neurons
 
 from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.baselines.spike_render import SpikeRender, SpikeRenderSettings
+from spike4dgs.benchmark.scene.camera_state import CameraState
+from spike4dgs.benchmark.spikes.sensor_model import fired
 from spike4dgs.method.supervision.base import Sample
 from spike4dgs.method.supervision.spike_cameras import fire
 
@@ -70,8 +72,13 @@ def test_the_right_image_fires_about_what_was_recorded(tick: int) -> None:
     assert right < 0.06 and brighter > right + 0.04 and darker > right + 0.04
 
 
-def test_expected_loss_is_least_at_the_recorded_rate() -> None:
-    scene = replace(WORLD.training, streams=tuple(_flat(0.437 * GAIN, seed) for seed in range(3)))
+@pytest.mark.parametrize(("gain", "dead_ticks"), [(1.0, 0.0), (1.2, 0.0), (1.0, 0.5)])
+def test_expected_loss_is_least_at_the_recorded_rate(gain: float, dead_ticks: float) -> None:
+    """Of cameras whose own gain is another one, too, and of those that gather no light after a spike."""
+    rate = fired(0.437 * GAIN * gain, dead_ticks)
+    streams = tuple(_flat(rate, seed, dead_ticks) for seed in range(3))
+    states = {camera.id: CameraState(gain=gain) for camera in WORLD.training.cameras}
+    scene = replace(WORLD.training, streams=streams, states=states)
     loss = SpikeRender(replace(SETTINGS, ssim_weight=0.0), scene)
     gradients = []
     for value in (0.427, 0.437, 0.447):  # within one spike of a window, which is 0.042 of white
@@ -83,14 +90,14 @@ def test_expected_loss_is_least_at_the_recorded_rate() -> None:
     assert gradients[0] < -0.1 and gradients[2] > 0.1 and abs(gradients[1]) < 0.1
 
 
-def _flat(rate: float, seed: int) -> SimpleNamespace:
+def _flat(rate: float, seed: int, dead_ticks: float) -> SimpleNamespace:
     """A stream of neurons that all see one radiance, from random charges."""
     charge = np.random.default_rng(seed).random((20, 32))
 
     def counts(start: int, stop: int) -> np.ndarray:
         return (np.floor(charge + rate * stop) - np.floor(charge + rate * start)).astype(np.uint16)
 
-    return SimpleNamespace(counts=counts, width=32, height=20, gaps=())
+    return SimpleNamespace(counts=counts, width=32, height=20, gaps=(), dead_ticks=dead_ticks)
 
 
 def test_noise_embedding_scales_and_lifts_its_own_view_only() -> None:

@@ -8,12 +8,13 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from small_scenes import HEIGHT, WIDTH, add_gap
+from small_scenes import HEIGHT, WIDTH, lose_ticks
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.dat import import_dat
 from spike4dgs.benchmark.exchange.recording import Recording
+from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.export_colmap import export_colmap
 
@@ -58,12 +59,19 @@ def test_the_way_there_and_back(small_scene: Path, tmp_path: Path, capsys: pytes
         np.testing.assert_allclose(camera.K, scene.cameras[camera.id].K, atol=1e-12)
 
 
-def test_images_at_missing_ticks_are_left_out(small_scene: Path, tmp_path: Path) -> None:
-    add_gap(small_scene, "cam_01", 35, 10)
+def test_images_at_missing_ticks_are_left_out_and_those_beside_them_no_darker(
+    small_scene: Path, tmp_path: Path
+) -> None:
+    lose_ticks(small_scene, "cam_01", 35, 10)
     with pytest.raises(UserError, match="a recording without gaps"):
         export_colmap(small_scene, tmp_path / "out")
     export_colmap(small_scene, tmp_path / "out", ticks=(20, 40), allow_gaps=True)
     assert not (tmp_path / "out/images/cam_01/000040.png").exists()
+    scene = open_scene(small_scene, allow_gaps=True)
+    filled = scene.training.streams[scene.train.index("cam_01")]
+    expected = encode_srgb(IMAGES["tfp"](filled, [20], scene.radiance_gain)[0])
+    with Image.open(tmp_path / "out/images/cam_01/000020.png") as found:
+        np.testing.assert_array_equal(np.asarray(found), expected)
     assert pycolmap.Reconstruction(str(tmp_path / "out/sparse/0")).num_images() == 5
 
 

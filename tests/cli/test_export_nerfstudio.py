@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_scenes import TICKS, array_cameras
+from small_scenes import TICKS, array_cameras, lose_ticks
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
@@ -112,6 +112,19 @@ def test_training_images_are_made_of_the_training_spikes(small_scene: Path, expo
     expected = IMAGES["tfp"](scene.stream("cam_01"), [40], scene.radiance_gain)[0]
     found = linear(next(f for f in frames if f.name == "cam_01_000040").rgb)
     assert np.abs(found - np.clip(expected, 0, 1)[..., None]).max() < 0.006, "half a step of 8 bits near white"
+
+
+def test_images_at_missing_ticks_are_left_out_and_those_beside_them_no_darker(
+    small_scene: Path, tmp_path: Path
+) -> None:
+    lose_ticks(small_scene, "cam_01", 35, 10)
+    export_nerfstudio(small_scene, tmp_path / "out", allow_gaps=True)
+    frames, scene = load(tmp_path / "out", "train"), open_scene(small_scene, allow_gaps=True)
+    assert [f.name for f in frames if f.name.startswith("cam_01")] == [f"cam_01_{t:06d}" for t in (0, 20, 60)]
+    filled = scene.training.streams[scene.train.index("cam_01")]
+    expected = IMAGES["tfp"](filled, [20], scene.radiance_gain)[0]
+    found = linear(next(f for f in frames if f.name == "cam_01_000020").rgb)
+    assert np.abs(found - np.clip(expected, 0, 1)[..., None]).max() < 0.006
 
 
 def test_validation_images_lie_between_the_training_times(exported: Path) -> None:

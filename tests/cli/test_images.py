@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, add_gap, shared_file
+from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, add_gap, lose_ticks, shared_file
 
 from spike4dgs.baselines.images.published.makers import MAKERS
 from spike4dgs.baselines.images.table import IMAGES
@@ -143,6 +143,18 @@ def test_images_at_missing_ticks_are_left_out(
     assert "a recording without gaps" in capsys.readouterr().err
     assert main([*arguments, "--allow-gaps"]) == 0
     assert sorted(p.stem for p in (tmp_path / "out").rglob("*.png")) == ["000000", "000020", "000060"]
+
+
+@pytest.mark.parametrize("method", ["tfp", "tfi", "adaptive"])
+def test_images_beside_missing_ticks_are_not_darker(small_scene: Path, tmp_path: Path, method: str) -> None:
+    """What a recorder lost is filled, as in a fit: zeros are no darkness."""
+    arguments = ["images", str(small_scene), "--camera", "cam_01", "--method", method, "--every", "4", "--allow-gaps"]
+    assert main([*arguments, "--out", str(tmp_path / "whole")]) == 0
+    lose_ticks(small_scene, "cam_01", 35, 10)
+    assert main([*arguments, "--out", str(tmp_path / "lost")]) == 0
+    for tick in (32, 48):
+        whole, lost = (read_exr(tmp_path / f"{of}/cam_01/{tick:06d}.exr").mean() for of in ("whole", "lost"))
+        assert lost == pytest.approx(whole, rel=0.04)
 
 
 @pytest.mark.parametrize(

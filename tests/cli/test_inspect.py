@@ -12,6 +12,7 @@ from small_scenes import shared_file
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.streams import DatFile
+from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings, isolated
@@ -177,6 +178,13 @@ def test_extreme_sizes_are_shown_without_warnings(tmp_path: Path, width: int, he
         writer.write(pack(fired))
     assert inspect(tmp_path / "s.dat", dat_file=DatFile(width, height, 20_000.0), out=tmp_path / "out") == 0
     assert (tmp_path / "out/s/s.png").is_file()
+
+
+def test_a_training_part_shows_the_cameras_that_it_has(small_scene: Path, tmp_path: Path) -> None:
+    """It has the pose of the held-out camera and not its stream."""
+    part = write_training_part(open_scene(small_scene), tmp_path / "part")
+    assert inspect(part.root, out=tmp_path / "out") == 0
+    assert sorted(p.stem for p in (tmp_path / "out/part").glob("*.png")) == ["cam_00", "cam_01", "cam_02"]
 
 
 def test_a_camera_without_a_spike_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -86,6 +86,21 @@ def test_missing_predictions_and_paths_are_refused(done: Path) -> None:
         submit(done / "nothing.json", leaderboard=done / "board")
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"predictions": Path("typo")}, "typo: expected a folder of predictions, METHOD/SCENE, found no such folder"),
+        ({"predictions": Path(".")}, "--predictions: expected --scenes beside it"),
+        ({"scenes": (Path("s0"),)}, "--scenes: expected --predictions beside it"),
+        ({"refit": True}, "--refit: expected --predictions and --scenes beside it"),
+        ({"container": "env"}, "--container: expected --refit beside it"),
+    ],
+)
+def test_options_that_would_verify_nothing_are_refused(done: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        verify_leaderboard(done / "board", **options)
+
+
 def test_other_predictions_of_the_method_are_refused(done: Path) -> None:
     with pytest.raises(UserError, match="give the predictions that were scored"):
         enter(done, predictions=done / "out/predictions/rough")
@@ -275,6 +290,12 @@ def test_an_edited_verification_is_found_with_the_files(
     assert not problems(entered, capsys)
     lines = problems(entered, capsys, **files(entered))
     assert len(lines) == 1 and "tfp+4dgs.json" in lines[0] and re.search(message, lines[0]), lines
+    if read(entry_of(entered))["verification"]["label"] == "re-scored":  # what the line says to do
+        enter(entered, replace=True)
+        assert not problems(entered, capsys, **files(entered))
+        before = entry_of(entered).read_bytes()
+        enter(entered, replace=True)
+        assert entry_of(entered).read_bytes() == before, "the same check again changes nothing"
 
 
 REFIT = {"psnr": {"pattern-0": 20.0}, "tolerance_db": 0.3, "bit_equal": False, "costs": {}, "apart": "process"}

@@ -101,6 +101,15 @@ def write_small_scene(
     return root
 
 
+def lose_ticks(scene: Path, camera: str, first_tick: int, ticks: int) -> None:
+    """Set ticks of a camera to zero, as a recorder leaves what it lost, and state the gap."""
+    path, a_tick = scene / stream_name(camera), WIDTH * HEIGHT // 8
+    data = bytearray(path.read_bytes())
+    data[first_tick * a_tick : (first_tick + ticks) * a_tick] = bytes(ticks * a_tick)
+    path.write_bytes(data)
+    add_gap(scene, camera, first_tick, ticks)
+
+
 def add_gap(scene: Path, camera: str, first_tick: int, ticks: int) -> None:
     """State in a scene's files that ticks of a camera are missing."""
     meta = json.loads((scene / "scene.json").read_text())

@@ -38,8 +38,9 @@ NAMELESS = "scene"  # the id of a part that does not say which scene it is of
 def training_files(scene: Scene, given: Collection[str] = GIVEN) -> list[str]:
     """Return the paths of the training cameras' recordings in a scene, of the kinds that are `given`."""
     patterns = [p for kind, of_kind in _RECORDINGS.items() if not kind or kind in given for p in of_kind]
-    prefixes = tuple(pattern.format(camera) for pattern in patterns for camera in scene.train)
-    return sorted(name for name in scene.manifest.files if name.startswith(prefixes))
+    wanted = {pattern.format(camera) for pattern in patterns for camera in scene.train}
+    # What comes before a file's ending or its name: `cam.` also begins the files of a camera `cam.1`.
+    return sorted(n for n in scene.manifest.files if {f"{n.rpartition(end)[0]}{end}" for end in "./"} & wanted)
 
 
 def write_training_part(scene: Scene, folder: Path) -> Scene:

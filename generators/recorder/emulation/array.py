@@ -119,6 +119,7 @@ def scene_profile(scene: Scene, **changes: Any) -> RigProfile:
         "licence": scene.meta["licence"],
         "sensor": scene.meta["sensor"]["model"],
         "radiance_gain": scene.radiance_gain,
+        "dead_ticks": float(scene.meta["sensor"].get("dead_ticks", 0)),
         "held_out": scene.test,
     }
     cameras = tuple(

@@ -107,6 +107,8 @@ def adjust(
     columns = _columns(len(rig.focal), len(rig.board_t), reference, freedom)
     if freedom.distortion and rig.lens is None:
         rig = replace(rig, lens=np.zeros((len(rig.focal), _PER_LENS)))
+    if freedom.shared_focal:  # all take the same steps, and so begin alike
+        rig = replace(rig, focal=np.full_like(rig.focal, rig.focal.mean()))
     damping = 1e-3
     cost, H, g = _normal(rig, detections, points, columns)
     for _ in range(_MOST_STEPS):

@@ -95,6 +95,10 @@ def test_what_moves_is_followed() -> None:
     assert psnr(model, 0.3) > psnr(model, 0.3, at=0.5) + 3 and psnr(model, 0.3) > 22
 
 
+def test_the_model_knows_the_cameras_that_the_fit_had() -> None:
+    assert fitted(0.0).cameras == job(travel=0.0).start.cameras
+
+
 def test_nothing_moves_where_no_pixel_changes() -> None:
     assert not fitted(0.0).field.occupancy.movable.any()
     images = [fitted(0.0).render(WORLD.held_out, t) for t in (0.0, 3000.0)]

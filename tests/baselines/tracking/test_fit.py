@@ -190,6 +190,11 @@ def test_finished_fit_is_read_back_and_another_fit_is_refused(tmp_path: Path) ->
         fit_tracking(replace(job(path, **TINY), key="that"))
 
 
+def test_the_model_knows_the_cameras_that_the_fit_had() -> None:
+    """What `fit` shows the images of: where poses were estimated, others than the scene's."""
+    assert uninterrupted().cameras == shown()[1].cameras
+
+
 def test_progress_counts_all_steps_to_the_end() -> None:
     seen: list[tuple[int, int]] = []
     fit_tracking(job(progress=lambda done, total, note="": seen.append((done, total)), **TINY))

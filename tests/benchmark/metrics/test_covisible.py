@@ -161,7 +161,9 @@ def test_a_scene_without_depth_or_with_damaged_files_has_no_value(small_scene: P
     scene = write_depth(small_scene)
     path = next((small_scene / "geometry/cam_01").iterdir())
     path.write_bytes(path.read_bytes()[:-10])
-    assert score(scene, tmp_path / "damaged", nothing)["metrics"]["psnr_covisible"] is None
+    cell = score(scene, tmp_path / "damaged", nothing)
+    assert cell["metrics"]["psnr_covisible"] is None and "psnr_covisible" not in cell["computed"], "nothing is claimed"
+    assert "the scene's depth cannot be read" in cell["notes"]["psnr_covisible"]
 
 
 def test_depth_of_another_size_or_instant_of_each_camera_is_not_used(small_scene: Path) -> None:
@@ -170,7 +172,7 @@ def test_depth_of_another_size_or_instant_of_each_camera_is_not_used(small_scene
     found = read_geometry(path)
     write_geometry(path, found.depth[:-1], found.ids[:-1], found.flow[:-1], 1000.0)
     write_manifest(small_scene)
-    assert covisible(open_scene(small_scene)) == {}
+    assert covisible(open_scene(small_scene)) is None
     write_geometry(path, found.depth, found.ids, found.flow, 1000.0)
     path.rename(path.with_name(f"{TICKS // 2:06d}.exr"))
     write_manifest(small_scene)

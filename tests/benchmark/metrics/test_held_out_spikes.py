@@ -86,9 +86,10 @@ def test_it_is_the_mean_over_rates_of_the_exact_law(ticks: int) -> None:
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e-6, 0.3, 0.999, 1.0, 1.001, 1.5, 4.0, 60.0, 2000.0])
-@pytest.mark.parametrize("spread", [1e-3, 0.05, 0.4, 3.0, 800.0])
+@pytest.mark.parametrize("spread", [1e-3, 0.05, 0.4, 3.0, 800.0, 9e3, 1.1e4, 1e6, 1e9])
 def test_its_logarithm_is_right_far_from_the_mean(offset: float, spread: float) -> None:
     """100 digits beside float64: E tri(d + s Z) by its second difference, from d = m (rate m / n - 1), n = m."""
+    offset *= max(1.0, spread / 1e3)  # wide ones matter far away
     if offset / spread > 3e5:
         return  # of such errors there are none: rates lie in [0, 1], and the tolerance is a few percent of white
     with mpmath.workdps(100):
@@ -105,7 +106,7 @@ def test_its_logarithm_is_right_far_from_the_mean(offset: float, spread: float) 
         return
     ticks = 7.0  # n = m: the recorded rate is 1, and s = tolerance * m
     found = law(ticks, ticks, 1 + offset / ticks, spread / ticks, np.inf)
-    assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    assert found == pytest.approx(expected, rel=1e-6, abs=1e-6 if spread < 1e3 else 1e-5)
 
 
 def test_it_is_finite_and_falls_with_the_error_everywhere() -> None:
@@ -193,12 +194,14 @@ def test_a_wrong_level_adds_its_square() -> None:
 
 
 @settings(max_examples=8, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_the_truth_is_best_and_noise_makes_it_worse(seed: int) -> None:
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1.0]))
+def test_the_truth_is_best_and_noise_makes_it_worse(seed: int, dead_ticks: float) -> None:
     rng = np.random.default_rng(seed)
     truth = rng.uniform(0.02, 0.98) * np.ones(SHAPE) + rng.uniform(-0.3, 0.3, SHAPE)
     truth = np.clip(truth, 0, 1)
-    recorded = record_around(filmed(truth, seed=seed % 1000), TICK, PLAIN)
+    sensor = Sensor(GAIN, photons=5e4, noise_seed=(seed % 1000,), dead_ticks=dead_ticks)
+    response = response_of(None, SHAPE, GAIN, dead_ticks)
+    recorded = record_around(filmed(truth, sensor, seed % 1000), TICK, response)
     noise = rng.normal(size=SHAPE)
     rows = [scores(recorded, truth + sigma * noise, truth) for sigma in (0, 0.06, 0.15, 0.4)]
     for metric in rows[0]:

@@ -198,6 +198,14 @@ def test_an_emulated_array_needs_the_raw_recordings(one_full_scene: Path, tmp_pa
         emulated_source(copy.root, None, DARK)
 
 
+def test_the_working_folder_is_a_folder_too(
+    scene_folders: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pack(open_scenes(scene_folders), Path("."), "1", 6_000_000)
+    assert (tmp_path / "release.json").is_file()
+
+
 def test_two_programs_do_not_pack_into_one_folder(scene_folders: tuple[Path, ...], tmp_path: Path) -> None:
     message = "expected a folder that no other program packs into, found a run in progress"
     with locked(tmp_path / ".1.lock", "x", "free"), pytest.raises(UserError, match=message):

@@ -10,6 +10,7 @@ import pytest
 from dummy_methods import CountMethod, run
 from matplotlib import colormaps
 from rich.console import Console
+from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.reports.console import Columns, print_results, seeds_of_methods
 from spike4dgs.benchmark.reports.error_map import choose_scale, error_image, error_levels, scale_name
@@ -78,6 +79,14 @@ def test_tables_for_papers_have_the_best_in_bold(small_scene: Path, tmp_path: Pa
     assert rf"ours[motion.lr\_grid=0.1] & \textbf{{{psnr}}} &" in latex and rf"a\_method & {less} &" in latex
     header, first = (line.split(" & ") for line in latex.splitlines() if " & " in line and "a\\_" not in line)
     assert len(header) == len(first) == 1 + latex.partition("{l")[2].partition("}")[0].count("r")
+
+
+def test_means_over_fewer_scenes_are_not_beside_the_others(small_scene: Path, tmp_path: Path) -> None:
+    scenes = [small_scene, write_small_scene(tmp_path / "other", seed=1)]
+    (whole,) = run(tmp_path / "a", scenes, CountMethod("whole"), metrics=("psnr",))
+    (part,) = run(tmp_path / "b", scenes[1:], CountMethod("part"), metrics=("psnr",))
+    text = printed([whole, part])
+    assert text.count("part") == 1 and text.count("whole") == 3, "a row a scene, and the mean of both"
 
 
 def test_a_seed_that_failed_leaves_no_mean(small_scene: Path, tmp_path: Path) -> None:

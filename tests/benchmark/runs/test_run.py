@@ -23,7 +23,7 @@ from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import method as recipes
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import FitRequest, get_method
+from spike4dgs.benchmark.method import Budget, FitRequest, get_method
 from spike4dgs.benchmark.runs.cell import FitClock, Job
 from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.record import check_record, of_scenes
@@ -99,6 +99,8 @@ def test_one_scene_run_again_keeps_the_cells_of_the_others(small_scene: Path, tm
     assert of_scenes(again, ["pattern-1"])["dataset"]["scenes"] == {"pattern-1": both["dataset"]["scenes"]["pattern-1"]}
     (changed,) = run(tmp_path / "out", [other], CountMethod(extra=1))
     assert list(changed["scenes"]) == ["pattern-1"], "cells of other parameters are no part of the record"
+    (longer,) = run(tmp_path / "out", [small_scene], CountMethod(extra=1), budget=Budget(2.0))
+    assert list(longer["scenes"]) == ["pattern-0"], "nor those of another budget"
     check_record(again, "again")
 
 

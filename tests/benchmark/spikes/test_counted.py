@@ -121,11 +121,12 @@ def test_other_windows_need_the_raw_recording() -> None:
 
 
 def test_bad_pixels_are_filled_alike() -> None:
-    stream, bad = recorded(3, 260, 0.4), np.zeros((HEIGHT, WIDTH), np.bool_)
+    stream, bad = replace(recorded(3, 260, 0.4), dead_ticks=0.5), np.zeros((HEIGHT, WIDTH), np.bool_)
     bad[1, 2] = bad[3, 4] = bad[5, 5] = bad[5, 6] = True
     filled, expected = fill_pixels(counted(stream), bad), counted(fill_pixels(stream, bad))
     for name, values in expected.arrays.items():
         assert_equal_bits(filled.arrays[name], values)
+    assert isinstance(filled, CountedRecording) and filled.dead_ticks == expected.dead_ticks == 0.5
     none = counted(stream)
     assert fill_pixels(none, None) is none
 

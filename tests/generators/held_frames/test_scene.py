@@ -124,6 +124,8 @@ def test_what_moves_is_found_and_nothing_else() -> None:
         ({"hold_ticks": 1}, "--hold-ticks"),
         ({"every": 0}, "--every"),
         ({"instants": 4}, "--instants"),
+        ({"instants": 0}, "--instants"),
+        ({"width": 0}, "--width"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused_before_anything_is_written(

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_json
 from recorder_rig import calibrated_scene
 from rig_text import RIG
 
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.cli import main
@@ -59,6 +62,15 @@ def test_an_emulated_capture_is_the_scene_bit_by_bit(scene, tmp_path, capsys, ho
     assert main(["verify", str(tmp_path / "x")]) == 0
     out = capsys.readouterr().out
     assert out.index("armed") < out.index("triggered") < out.index("closed") < out.index("80 ticks of 4 cameras")
+
+
+def test_a_capture_has_the_scenes_dead_ticks(scene, tmp_path):
+    shutil.copytree(scene, tmp_path / "dead")
+    edit_json(tmp_path / "dead/scene.json", lambda meta: meta["sensor"].update(dead_ticks=0.5))
+    write_manifest(tmp_path / "dead")
+    assert record("--emulate", tmp_path / "dead", "--out", tmp_path / "out") == 0
+    captured = open_scene(tmp_path / "out")
+    assert captured.stream("cam_00").dead_ticks == open_scene(tmp_path / "dead").stream("cam_00").dead_ticks == 0.5
 
 
 @pytest.mark.usefixtures("no_images")
@@ -182,6 +194,9 @@ def test_light_that_does_not_fit_is_refused(scene, tmp_path):
         sources.light_truth(replace(light, flat_radiance=0.0), profile)
     with pytest.raises(UserError, match="calibrate-rig"):
         sources.light_truth(light, command._without_poses(profile))
+    edit_json(tmp_path / "dark/stream.json", lambda facts: facts.update(rows_bottom_up=False))
+    with pytest.raises(UserError, match="expected the bottom row first, as in a scene"):
+        sources.light_truth(light, profile)
 
 
 # ------------------------------------------------------------ arguments

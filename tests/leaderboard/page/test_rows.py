@@ -8,6 +8,8 @@ import pytest
 from submissions import enter, release_of
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.runs.record import of_scenes, read_record
 from spike4dgs.leaderboard.page.rows import OWN, Board, find_board, gather, titles
 from spike4dgs.leaderboard.tracks import ARCHIVE, PUBLIC
 
@@ -41,6 +43,17 @@ def test_a_run_lends_its_images_to_the_entry_that_it_became(done: Path, monkeypa
     rows = {r.name: r for r in find_board(boards, "patterns").rows}
     assert sorted(rows) == ["out/bad", "out/rough", "tfp+4dgs"]
     assert rows["tfp+4dgs"].label == "re-scored" and set(rows["tfp+4dgs"].predictions) == {"pattern-0", "pattern-1"}
+
+
+def test_seeds_of_fewer_scenes_are_a_board_of_their_own(done: Path) -> None:
+    """As a run of several seeds that was killed leaves them."""
+    whole = read_record(done / "out/results/tfp+4dgs.json")
+    part = of_scenes({**whole, "method": {**whole["method"], "seed": 1}}, ["pattern-1"])
+    write_json(done / "out/seed-1/results/tfp+4dgs.json", part)
+    (done / "out/seed-1/results/.tfp+4dgs.77.part.json").write_text("{")  # and half of a file
+    boards = [b for b in gather(done / "none", (done / "out",))[0] if b.rows]
+    assert sorted(b.scenes for b in boards) == [["pattern-0", "pattern-1"], ["pattern-1"]]
+    assert [len(r.records) for b in boards for r in b.rows if r.name == "out/tfp+4dgs"] == [1, 1]
 
 
 def test_a_folder_without_records_is_refused(tmp_path: Path) -> None:

@@ -57,6 +57,17 @@ def test_public_files_alone_say_what_remains(over: Made, capsys: pytest.CaptureF
         assert f"spike4dgs make-dataset {seed.world} {way}" in out
 
 
+def test_tars_alone_are_checked_and_nothing_else(
+    over: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for pack in (over.root / "scenes").glob("*.tar"):
+        shutil.copy(pack, tmp_path)
+    capsys.readouterr()
+    assert checked(over, scenes=tmp_path) == 0
+    out = capsys.readouterr().out
+    assert out.count("is the tar committed to") == 4 and out.count("not checked: ") == 4
+
+
 def test_season_0_is_revealed_and_right(capsys: pytest.CaptureFixture[str]) -> None:
     seasons = Path(__file__).resolve().parents[3] / "leaderboard/seasons"
     assert check(0, seasons=seasons) == 0

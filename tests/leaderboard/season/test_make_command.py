@@ -102,6 +102,8 @@ def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]
         ({"worlds": ("car", "car")}, "--worlds: expected worlds, each once"),
         ({"worlds": ()}, "--worlds: expected worlds, each once, found none"),
         ({"closes": "soon"}, "--closes: expected a day"),
+        ({"closes": "20270131"}, "--closes: expected a day"),
+        ({"fit_seed": -1}, "--fit-seed: expected a number from 0 up"),
         ({"budget": "much"}, "--budget: expected"),
     ],
 )

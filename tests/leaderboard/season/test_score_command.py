@@ -16,7 +16,7 @@ from spike4dgs.benchmark.method import Budget
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.cli.season import reveal, score
+from spike4dgs.cli.season import check, reveal, score
 from spike4dgs.leaderboard.season.results import predict_all, read_results, write_result
 from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
 
@@ -50,6 +50,13 @@ def test_the_table_ranks_by_psnr(scored_once: Made) -> None:
     assert [row.split(" | ")[:4] for row in rows] == [
         [f"| {i}", r.name, "predictions", f"{r.record['mean']['psnr']:.2f}"] for i, r in enumerate(results, start=1)
     ]
+
+
+def test_half_a_result_of_a_killed_process_is_none(scored: Made) -> None:
+    (scored.public / "results/.counts.77.part.json").write_text('{"schema":')
+    assert {r.name for r in read_results(scored.seasons, scored.season)} == {"counts", "rough"}
+    assert scored.score("counts", "rough") == 0
+    assert check(NUMBER, seasons=scored.seasons, scenes=None, predictions=None) == 0
 
 
 @pytest.mark.parametrize("name", ["Counts", "co.unts", "COUNTS_"])

@@ -5,6 +5,8 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -124,6 +126,13 @@ def test_other_sensors_of_training_cameras_are_in_it(made: Made) -> None:
     names = training_files(open_scene(whole.root))
     assert "conventional/cam_00/000000.png" in names and "conventional/cam_04/000000.png" not in names
     assert {n.split("/")[0] for n in names} == {"spikes", "calibration", "conventional", "events"}
+
+
+def test_a_name_that_begins_like_a_training_cameras_is_another() -> None:
+    names = ("spikes/cam.dat", "spikes/cam.1.dat", "calibration/flat/cam.npz", "calibration/flat/cam.1.npz")
+    names += ("events/cam.npz", "events/cam.1.npz", "conventional/cam/000010.exr", "conventional/cam.1/000010.exr")
+    scene = SimpleNamespace(train=("cam",), manifest=SimpleNamespace(files=dict.fromkeys(names)))
+    assert training_files(cast(Scene, scene)) == sorted(name for name in names if "cam.1" not in name)
 
 
 def test_a_pack_unpacks_to_the_scene(small_scene: Path, tmp_path: Path) -> None:

@@ -1,9 +1,29 @@
 from __future__ import annotations
 
 import numpy as np
+from toy_world import ToyWorld
 
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.baselines.images.tfp import TfpSettings
+from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB
-from spike4dgs.method.recordings.comparison import residual_db
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.method.recordings.comparison import compare, residual_db
+
+
+class Black:
+    def render(self, camera: Camera, t_us: float) -> np.ndarray:
+        return np.zeros((camera.height, camera.width), np.float32)
+
+
+def test_the_images_are_those_that_the_fit_has() -> None:
+    """By the recipe's own settings of its image maker."""
+    scene = ToyWorld(width=32, height=20, side=2, n_ticks=120).training
+    method = METHODS["tfp+4dgs"].with_settings({"image_maker.half_window": 5}, "short")
+    found = compare(method, Black(), scene, scene.cameras, "cpu", IMAGES["tfi"])
+    maker = IMAGES["tfp"].with_settings(TfpSettings(half_window=5))
+    expected = maker(scene.streams[0], [round(found.times_us[4] * scene.rate_hz / 1e6)], scene.radiance_gain)[0]
+    np.testing.assert_array_equal(found.images[4, 0], expected)
 
 
 def test_the_residual_of_equal_images_is_finite() -> None:

@@ -294,6 +294,12 @@ def test_what_cannot_be_done_is_said(
         (("--out", str(tmp_path / "a"), "--method", "nearest-view"), "a method whose models can be saved"),
         (("--out", str(tmp_path / "b"), "--method", "magic"), "one of "),
         (("--out", str(tmp_path / "c"), "--budget", "much"), "--budget"),
+        (
+            ("--out", str(tmp_path / "e"), "--set", "images.time_spacing_ticks=0"),
+            "time_spacing_ticks and max_times of 1",
+        ),
+        (("--out", str(tmp_path / "e"), "--set", "density.refine_every=0"), "refine_every of 1 step or more"),
+        (("--out", str(tmp_path / "f"), "--set", "trainer.lr_last=0"), "learning rates above 0"),
     ):
         method = () if "--method" in arguments else ("--method", "tfp+4dgs")
         budget = () if "--budget" in arguments else ("--budget", "0.02")

@@ -56,13 +56,18 @@ def test_an_orbit_is_closed_stays_within_the_array_and_faces_the_focus(cameras: 
 
 
 def test_the_rig_path_visits_every_training_camera_in_short_steps() -> None:
-    cameras = tuple(replace(c, fx=c.fx + i, cy=c.cy + i) for i, c in enumerate(WORLD.cameras))
+    lens = (-0.1, 0.02, 0.0, 0.0, 0.0)
+    cameras = tuple(
+        replace(c, fx=c.fx + i, cy=c.cy + i, distortion=tuple(i * k for k in lens) if i else ())
+        for i, c in enumerate(WORLD.cameras)
+    )
     path = rig(cameras)
     stops = [path(s) for s in np.linspace(0, 1, len(cameras))]
     for camera in cameras:
         near = min(stops, key=lambda c: np.linalg.norm(c.center - camera.center))
         np.testing.assert_allclose(near.w2c, camera.w2c, atol=1e-9)
         np.testing.assert_allclose(near.K, camera.K, atol=1e-9)
+        np.testing.assert_allclose(near.distortion or np.zeros(5), camera.distortion or np.zeros(5), atol=1e-9)
     steps = [np.linalg.norm(b.center - a.center) for a, b in itertools.pairwise(stops)]
     assert max(steps) < 0.81, "never across the array"
     between = path(0.5 / (len(cameras) - 1))

@@ -6,6 +6,7 @@ import socket
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -55,6 +56,15 @@ def test_the_three_images() -> None:
     colors = error_colors()[np.rint(error / ERROR_MAX * 255).astype(int)]
     assert np.abs(shown.image("error", camera, t_us).astype(int) - colors).max() <= 3
     assert error_colors()[0].sum() < 10 and error_colors()[-1].sum() > 600, "from black to nearly white"
+
+
+def test_ticks_in_which_no_light_is_gathered_are_counted_out() -> None:
+    """A pixel that gathers nothing for half a tick after each spike has seen x = r / (1 - r / 2)."""
+    camera, t_us, scene = TRAINED[1], 0.5 * DURATION_US, WORLD.training
+    rate = content().spike_rate(camera.id, t_us) * scene.radiance_gain
+    slow = replace(scene, streams=tuple(replace(stream, dead_ticks=0.5) for stream in scene.streams))
+    found = replace(content(), scene=slow).spike_rate(camera.id, t_us)
+    np.testing.assert_allclose(found, rate / (1 - rate / 2) / scene.radiance_gain, rtol=1e-5)
 
 
 def test_without_the_scene_there_is_only_the_model() -> None:
