@@ -194,7 +194,9 @@ def test_light_that_does_not_fit_is_refused(scene, tmp_path):
         sources.light_truth(replace(light, flat_radiance=0.0), profile)
     with pytest.raises(UserError, match="calibrate-rig"):
         sources.light_truth(light, command._without_poses(profile))
-    edit_json(tmp_path / "dark/stream.json", lambda facts: facts.update(rows_bottom_up=False))
+    edit_json(
+        tmp_path / "dark/stream.json", lambda facts: [s.update(rows_bottom_up=False) for s in facts["streams"].values()]
+    )
     with pytest.raises(UserError, match="expected the bottom row first, as in a scene"):
         sources.light_truth(light, profile)
 
