@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians, concatenate, from_points
@@ -135,7 +136,7 @@ def _render(
 ) -> tuple[RenderOutput, Tensor]:
     """Return the render of one view at t, and its gray image [H, W]."""
     camera = images.views.some([view])
-    out = render(motion.splats(gaussians, t), camera, depth=True)
+    out = render(motion.splats(gaussians, t), camera, motion.pixel_filter, depth=True)
     return out, motion.image(out.image, camera)[0]
 
 
@@ -226,9 +227,12 @@ class SpacetimeLite(PolynomialMotion):
 
     def guided_samples(self, gaussians: Gaussians, images: TrainingImages, generator: torch.Generator) -> Gaussians:
         """Return the Gaussians followed by new ones where the worst views lack some (`guide`)."""
-        duration = self.settings.moving_temporal_scale
-        new = guide(self, gaussians, images, generator)
-        return concatenate([gaussians, *(self.timed(g, torch.full((len(g),), t), duration) for g, t in new)])
+        duration, lamp = self.settings.moving_temporal_scale, gaussians.colors.shape[1] - 1
+        new = []
+        for g, t in guide(self, gaussians, images, generator):
+            dark = replace(g, colors=functional.pad(g.colors, (0, lamp)))  # in a lamp's light, where there is one
+            new.append(self.timed(dark, torch.full((len(g),), t), duration))
+        return concatenate([gaussians, *new])
 
     def after_densification(self, edit: Edit, generator: torch.Generator) -> Edit:
         """Return the edit with the added Gaussians moved to random times, along their paths."""

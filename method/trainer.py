@@ -72,6 +72,7 @@ class Trainer:
             raise problem("settings", expected, f"{settings.average:g}", "average fewer steps")
         self.training_images, self.motion, self.supervision = images, motion, supervision
         self.settings, self.density, self.scale, self.seed, self.path = settings, density, scale, seed, path
+        motion.pixel_filter = settings.pixel_filter
         self.plan = stages(settings, motion.moves, motion.rests_first, motion.pieces)
         self.total = sum(s.steps for s in self.plan)
         self.step = 0
@@ -242,7 +243,8 @@ class Trainer:
         rng = seeded(self.seed, self.step)
         for edit in adapt_density(self.gaussians, self.statistics, s, self.scale, limit, rng):
             self.gaussians = apply_edit(self.adam, self.motion.after_densification(edit, rng))
-        if stage.deforms and 2 <= done // s.refine_every < 2 + self.motion.guided_rounds:
+        # Not where the array moves: the motion's Gaussians are in the world's frame, and views in the array's.
+        if stage.deforms and not self.path and 2 <= done // s.refine_every < 2 + self.motion.guided_rounds:
             more = self.motion.guided_samples(self.gaussians, self.training_images, rng)
             self.gaussians = apply_edit(self.adam, appended(more, len(self.gaussians)))
         self.coherence.forget()

@@ -56,6 +56,8 @@ def choose_ticks(n_ticks: int, settings: ImageSettings) -> tuple[int, ...]:
     edge = min(settings.edge_ticks, (n_ticks - 1) // 2)
     span = n_ticks - 2 * edge
     count = min(settings.max_times, max(1, round(span / settings.time_spacing_ticks) + 1))
+    if count == 1:
+        return (n_ticks // 2,)
     return tuple(sorted({int(t) for t in np.rint(np.linspace(edge, n_ticks - 1 - edge, count))}))
 
 
@@ -135,7 +137,8 @@ def _spans(scene: TrainingScene, measured: list[Half], doubts: list[Half | None]
     """Return the spans of time that the training images [T, C] are means over."""
     ends = np.stack(measured, axis=1)
     lengths = (ends[:, :, 1] - ends[:, :, 0]).astype(np.float32)
-    half = float(np.median(lengths[lengths > 0] if (lengths == 0).any() else lengths)) / 2
+    known = lengths[lengths > 0] if lengths.any() else np.ones_like(lengths)  # light is the same all the time
+    half = float(np.median(known)) / 2
     doubtful = None
     if any(own is not None for own in doubts):
         none = np.zeros((len(ends), 4, *ends.shape[3:]), np.float16)

@@ -14,6 +14,7 @@ from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Splats, Views
+from spike4dgs.method.splat.types import CUSTOMARY, PixelFilter
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 
@@ -42,6 +43,7 @@ class Motion(nn.Module):
     published: ClassVar[Mapping[str, Any]] = {}  # overrides that give the step counts of the publication
     moves: ClassVar[bool] = True  # False: all times are the same, and only the static stage is trained
     rests_first: ClassVar[bool] = True  # a static stage comes before the moving one
+    pixel_filter: PixelFilter = CUSTOMARY  # of the fit's renders; the trainer sets it
 
     @property
     def pieces(self) -> int:

@@ -155,6 +155,8 @@ class HexPlaneMotion(Motion):
         out = perceptron(self.planes(gaussians.means, t), layers)
         added = dict(zip(self.last, out, strict=True))
         added["means"], added["logits"] = added["means"] * self.scale, added["logits"][:, 0]
+        if lamp := gaussians.colors.shape[1] - 1:  # what a lamp adds changes with the lamp alone
+            added["colors"] = functional.pad(added["colors"], (0, lamp))
         return Gaussians.from_tensors({name: value + added[name] for name, value in gaussians.tensors().items()})
 
     def splats(self, gaussians: Gaussians, t: float) -> Splats:

@@ -148,7 +148,7 @@ def sweep(
             inside = warped >= 0
             total += np.maximum(_correlation(reference, mean, variance, warped, settings), 0) * inside
             seen += inside
-        total /= np.maximum(seen, 2)  # a plane that a single view sees proves nothing
+        total /= np.maximum(seen, min(2, len(others)))  # of several, a plane that a single view sees proves nothing
     found = _peak(scores, planes)
     whole = DepthMap(np.zeros(images.shape[1:], np.float32), np.full(images.shape[1:], -1, np.float32))
     whole.inverse[top:bottom, left:right], whole.score[top:bottom, left:right] = found.inverse, found.score
@@ -208,7 +208,7 @@ def pixels_of(camera: Camera, points: Float64) -> tuple[Mask, Int64, Int64, Floa
 
 
 def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int, settings: SweepSettings = DEFAULTS) -> Mask:
-    """Return the pixels [H, W] of view `index` on whose depth at least `min_agree` other views agree."""
+    """Return the pixels [H, W] of view `index` on whose depth `min_agree` other views agree, or the only other."""
     camera, own = cameras[index], maps[index]
     believed = (own.score > settings.min_score) & (own.inverse > 0)
     points = lift(camera, own.inverse, believed)
@@ -220,5 +220,5 @@ def agreed(cameras: Sequence[Camera], maps: Sequence[DepthMap], index: int, sett
         inside, u, v, z = pixels_of(cameras[other], points)
         inverse = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
         votes += inside & (np.abs(other_map.inverse[v, u] - inverse) < tolerance)
-    believed[believed] = votes >= settings.min_agree
+    believed[believed] = votes >= min(settings.min_agree, len(cameras) - 1)
     return believed

@@ -21,6 +21,7 @@ from spike4dgs.baselines.spacetime import (
     Spacetime,
     SpacetimeLite,
     SpacetimeSettings,
+    _render,
     along_rays,
     bad_pixels,
     guide,
@@ -33,6 +34,7 @@ from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.polynomial import move_to
 from spike4dgs.method.splat import Splats, Views, render
 from spike4dgs.method.splat.reference import rotation_matrices
+from spike4dgs.method.splat.types import CUSTOMARY, PixelFilter
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.training_views.points import look_up, project, variation_at
 from spike4dgs.method.training_views.training_images import TrainingImages
@@ -306,6 +308,23 @@ def test_points_lie_on_their_pixels_rays_at_the_depths_that_the_view_shows() -> 
     assert (np.abs(z - 2.0) < 0.05 * 2.0 + 0.1).all() and len(set(np.round(z, 4))) == 6
 
 
+def test_a_model_that_equals_its_images_has_no_bad_pixels_by_the_filter_of_the_fit() -> None:
+    """By another one its edges look wrong."""
+    camera = array_cameras(2, width=WIDTH, height=HEIGHT)
+    motion = SpacetimeLite(Extent(-torch.ones(3), torch.ones(3), 2.0, 100, WIDTH), SpacetimeLite.defaults, seeded(0, 0))
+    s = wall(camera[0], 2.5)
+    thin = Gaussians(s.means, (s.scales * 0.3).log(), s.quats, torch.full((len(s),), 4.0), s.colors)
+    g, views = motion.timed(thin, torch.full((len(thin),), 0.5), 1e6), Views.from_cameras(camera)
+    sharp = PixelFilter(1 / 12, True)
+    truth = render(motion.splats(g, 0.5), views, sharp).image[..., 0]
+    images = TrainingImages(views, (50,), truth[None], 100)
+    errors = []
+    for motion.pixel_filter in (sharp, CUSTOMARY):
+        _, image = _render(motion, g, images, 1, 0.5)
+        errors.append(float((image - truth[1]).abs().max()))
+    assert errors[0] == 0 < errors[1]
+
+
 def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     cameras = array_cameras(4, width=WIDTH, height=HEIGHT)
     extent = Extent(-torch.ones(3), torch.ones(3), 2.0, 100, WIDTH)
@@ -325,6 +344,9 @@ def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     assert (uv > 32).all() and (uv < 64).all()
     more = motion.guided_samples(g, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
     assert len(more) == len(g) + sum(len(x) for x, _ in new)
+    lamp = replace(g, colors=torch.cat([g.colors, torch.ones_like(g.colors)], dim=1))
+    beside = motion.guided_samples(lamp, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
+    assert beside.colors.shape[1] == 2 and not beside.colors[len(g) :, 1].any(), "new ones have no share of a lamp yet"
     assert torch.equal(more.means[: len(g)], g.means) and set(more.extra["times"][len(g) :].tolist()) == {
         torch.tensor(t).item() for t in (0.9, 0.1)
     }

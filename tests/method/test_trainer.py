@@ -347,6 +347,11 @@ def test_training_ticks_lie_inside_the_clip_and_are_bounded(n_ticks):
     assert 0 <= ticks[0] and ticks[-1] < n_ticks and len(ticks) <= 256 and list(ticks) == sorted(set(ticks))
 
 
+def test_a_single_training_image_is_in_the_middle():
+    for alone in (ImageSettings(max_times=1), ImageSettings(time_spacing_ticks=1000)):
+        assert choose_ticks(401, alone) == (200,)
+
+
 def test_extent_comes_from_the_points_and_not_only_from_the_array():
     scene = WORLD.training
     start = surfaces(scene, 0)

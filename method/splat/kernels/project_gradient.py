@@ -82,7 +82,7 @@ def project_backward(
     """
     keys, chunks, n_colors = records.keys, records.sums.shape[0], gradients.colors.shape[1]
     n_all, views = len(geometry.means), len(cameras.entries)
-    per_chunk = (n_colors + (records.depth_channel >= 0) + chunks - 1) // chunks
+    per_chunk = 4 if chunks > 1 else n_colors + (records.depth_channel >= 0)  # as `cpu.chunking` has them
     while True:
         block = fetch_add(counter, 0, 1)
         first = block * BLOCK

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -59,6 +61,16 @@ def test_every_parameter_can_be_deformed_and_learns():
         assert not torch.equal(value, g.tensors()[name]), name
     sum(v.sum() for v in moved.tensors().values()).backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in m.parameters())
+
+
+def test_a_lamps_layer_changes_with_the_lamp_alone():
+    m, g = motion(), gaussians()
+    torch.nn.init.ones_(m.last["colors"].bias)
+    beside = replace(g, colors=torch.cat([g.colors, torch.rand(len(g), 1, generator=rng(3))], dim=1))
+    moved = m.deform(beside, 0.5)
+    assert torch.equal(moved.colors[:, :1], m.deform(g, 0.5).colors) and torch.equal(
+        moved.colors[:, 1], beside.colors[:, 1]
+    )
 
 
 def test_means_move_in_units_of_the_scene():

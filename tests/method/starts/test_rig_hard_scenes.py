@@ -104,6 +104,14 @@ def test_two_cameras_and_a_clip_shorter_than_a_window_are_enough_to_begin() -> N
     assert len(s.points) >= 100 and np.isfinite(s.points).all()
 
 
+def test_two_cameras_match() -> None:
+    """Each has one other view to agree with: points lie on the surfaces, not all on one plane."""
+    scene = STATIC.training
+    s = rig(dataclasses.replace(scene, cameras=scene.cameras[:2], streams=scene.streams[:2]))
+    surface, board = distance(STATIC, s.points, 0.5)
+    assert (np.minimum(surface, board) < 0.1).mean() > 0.3
+
+
 @pytest.mark.parametrize("chosen", [(0,), (0, 0, 0)])
 def test_cameras_at_one_position_are_a_user_error(chosen: tuple[int, ...]) -> None:
     scene = gray_scene(tuple(SMALL.cameras[i] for i in chosen), 0)
