@@ -138,12 +138,12 @@ def run_benchmark(
         found = f"--table {choice.table}" if choice.table else "no table"
         fix = "without a table, name the methods, such as tfp+colmap+4dgs"
         raise problem("--poses", "--table 1 or 2 beside it", found, fix)
-    if choice.table == IMAGE_TABLE:
-        return _measure_images(scenes, choice, fits.out)
-    paper = None if choice.table is None else published(choice.table, choice.poses)
-    if choice.track is not None and (scenes or paper):
+    if choice.track is not None and (scenes or choice.table is not None):
         found = str(scenes[0]) if scenes else f"--table {choice.table}"
         raise problem("--track", "neither scenes nor a table beside it", found, "use --data for the folder")
+    if choice.table == IMAGE_TABLE:
+        return _measure_images(scenes, choice, fits, entries)
+    paper = None if choice.table is None else published(choice.table, choice.poses)
     if paper:
         if scenes:
             raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
@@ -154,9 +154,13 @@ def run_benchmark(
     return _finish(runs, scenes, choice.allow_gaps, entries)
 
 
-def _measure_images(scenes: tuple[Path, ...], choice: SceneChoice, out: Path) -> int:
+def _measure_images(scenes: tuple[Path, ...], choice: SceneChoice, fits: FitChoice, entries: EntryChoice) -> int:
     """Make table 6, which compares images from spikes and fits no method."""
     from spike4dgs.studies.images import images
+
+    given = {"--methods": fits.methods, "--set": fits.settings, "--split": choice.split, "--seeds": fits.seeds > 1}
+    for option in (name for name, value in {**given, "--leaderboard": entries.leaderboard}.items() if value):
+        raise problem(option, "no --table 6 beside it, which fits nothing", "both", "leave one of them out")
 
     worlds = [world for number in (1, 2) for world in published(number).worlds]
     data, profile = choice.data, choice.profile
@@ -164,7 +168,7 @@ def _measure_images(scenes: tuple[Path, ...], choice: SceneChoice, out: Path) ->
     if not chosen:
         fix = f"spike4dgs make-dataset --all --profile {profile} --out {data}"
         raise problem(data, f"a scene WORLD-0-{profile}", "none", fix)
-    return images(chosen, out=out, allow_gaps=choice.allow_gaps)
+    return images(chosen, out=fits.out, allow_gaps=choice.allow_gaps)
 
 
 def _run_table(paper: PublishedTable, choice: SceneChoice, fits: FitChoice, entries: EntryChoice) -> int:

@@ -37,6 +37,10 @@ def rendering_of(job: Job) -> Job:
     return replace(job, physics=replace(job.physics, **without), gain_map=True, dark_map=True, shot_noise=True)
 
 
+# Of `scene/`: what cameras and their light make, which every scene has of its own.
+_OWN = ("spikes", "calibration", "conventional", "events", "truth")
+
+
 @dataclass
 class SharingMaker(Maker):
     """A maker that takes the rendering of its scene from OUT/.work, or leaves it there for the next one.
@@ -67,7 +71,7 @@ class SharingMaker(Maker):
 
     def _copy(self, source: Path, destination: Path) -> None:
         """Copy the files of a work folder elsewhere: keys, backgrounds and, where the light is steady, ground truth."""
-        left_out = ["settings.json", *(["scene"] if self.job.flicker else [])]
+        left_out = ["settings.json", *_OWN, *(["scene"] if self.job.flicker else [])]
         part = destination.with_name(f"{destination.name}.part")
         shutil.rmtree(part, ignore_errors=True)
         shutil.copytree(source, part, ignore=shutil.ignore_patterns(*left_out))

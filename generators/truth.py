@@ -154,8 +154,9 @@ def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, di
     """
     view = held_out_view(job)
     camera = cameras_of(job)[view]
-    first = job.target_ticks[:: max(1, len(job.target_ticks) // _PAIRS)][:_PAIRS]
-    pairs = [(t, t + TARGET_EVERY) for t in first if t + TARGET_EVERY in job.target_ticks]
+    lit = [t for t in job.target_ticks if job.light_at(t) > 0]
+    first = lit[:: max(1, len(lit) // _PAIRS)][:_PAIRS]
+    pairs = [(t, t + TARGET_EVERY) for t in first if t + TARGET_EVERY in lit]
     ticks = sorted({t for pair in pairs for t in pair})
     own = [second_truth(job, view, job.seed + seed) for seed in _SEEDS]
     objects = renderer_of(job, [camera], truth=True)

@@ -28,6 +28,7 @@ from spike4dgs.generators.recorder.emulation.imperfections import Imperfections
 from spike4dgs.generators.recorder.record import Emulation, record
 from spike4dgs.generators.recorder.sources import Light
 from spike4dgs.method.recordings.fit import PREDICTIONS, fit_recording
+from spike4dgs.studies.kit.checkout import code_now
 from spike4dgs.studies.kit.timing import markdown, write_csv
 
 FLAT_RADIANCE = 0.7  # of the emulated uniform light
@@ -115,6 +116,8 @@ def fault_table(
     """
     truth = _with_truth(scene)
     curved = None if lens_scene is None else _with_truth(lens_scene)
+    of = {"scene": truth.revision, "budget": make_budget(budget).label, "seed": seed, "code": code_now()}
+    _check_same(out / "about.json", of | ({"lens_scene": curved.revision} if curved else {}))
     found: list[Outcome] = []
     about = {"scene": truth.id, "budget": budget, "seed": seed, "command": command_line(), "harness": harness()}
     about["environment"] = environment("cpu")
@@ -131,6 +134,14 @@ def fault_table(
             _write(out, found, about)
     print(f"table: {out}/{{table.md,table.csv,table.json,table.png}}")
     return 0
+
+
+def _check_same(path: Path, about: dict[str, Any]) -> None:
+    """Raise UserError where a folder has captures and fits of something else."""
+    kept = read_json(path, "what captures and fits are of") if path.is_file() else {}
+    if other := [name for name, value in about.items() if kept.get(name, value) != value]:
+        raise problem(path.parent, f"captures and fits of this {other[0]}", "those of another", "choose another --out")
+    write_json(path, {**kept, **about})
 
 
 def _with_truth(scene: Path) -> Scene:
@@ -160,8 +171,8 @@ def _scored(fit: Callable[[], None], out: Path, truth: Scene) -> dict[str, Any]:
         try:
             fit()
             scores: dict[str, Any] = {**_scores(out / PREDICTIONS, truth), "error": ""}
-        except UserError as e:
-            scores = {**dict.fromkeys(METRICS), "error": str(e)}
+        except UserError as e:  # the next run tries again
+            return {**dict.fromkeys(METRICS), "error": str(e)}
         write_json(kept, scores)
     return read_json(kept, "the scores of a fit")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -93,7 +94,10 @@ def hard_cases(
     write_json(out / "hard_cases.json", report)
     _write_page(out / "index.html", report)
     print(f"{_counted(report['cases'])}\npage: {out / 'index.html'}\nJSON: {out / 'hard_cases.json'}", flush=True)
-    return int(any(c["passed"] is False for c in report["cases"]))
+    failed = any(c["passed"] is False for c in report["cases"])
+    if code == pytest.ExitCode.TESTS_FAILED and not failed:
+        print("a test failed before it told of its case: see the lines above", file=sys.stderr)
+    return int(failed or code == pytest.ExitCode.TESTS_FAILED)
 
 
 class Cases:

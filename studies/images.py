@@ -69,6 +69,8 @@ def images(
         allow_gaps: Accept recordings with gaps.
     """
     opened = [open_scene(path, allow_gaps) for path in scenes]
+    if repeats < 1:
+        raise problem("--repeats", "1 or more", str(repeats), "correct it")
     rows = [measure_maker(name, maker, opened, repeats) for name, maker in IMAGES.items()]
     size = f"ms {opened[0].meta['width']}x{opened[0].meta['height']}" if opened else "ms, scene"
     quality = ("PSNR", "SSIM", "PSNR, moving", "PSNR, corrected", "moving, corrected")
@@ -110,9 +112,9 @@ def measure_maker(name: str, maker: ImageMaker, scenes: Sequence[Scene], repeats
         first, tick, gain = held_out(scenes[0], middle_target(scenes[0]))
         scene_ms = by_turns_ms([partial(maker, first, [tick], gain)], repeats)[0][1]
     cameras = {s.id: calibrations(s) for s in scenes}
-    corrected = {
-        s.id: score_maker(maker, s, cameras[s.id], QUALITY) for s in scenes if len(cameras[s.id]) == len(s.test)
-    }
+    # A mean over some scenes tells nothing beside one over all.
+    calibrated = all(len(cameras[s.id]) == len(s.test) for s in scenes)
+    corrected = {s.id: score_maker(maker, s, cameras[s.id], QUALITY) for s in scenes} if calibrated else {}
     quality = {scene.id: score_maker(maker, scene, {}, QUALITY) for scene in scenes}
     return Row(name, ms, scene_ms, quality, corrected, STANDS_IN.get(name, ""))
 

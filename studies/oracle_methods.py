@@ -82,7 +82,7 @@ class OracleMethod:
         self.name = f"{base}+oracle-{'-'.join(replaced)}"
         found = RecipeMethod(self._recipe, PARTS)
         given: dict[str, Any] = {"base": base, "replaced": list(replaced)}
-        given |= {"samples": samples} if "images" in replaced else {}
+        given |= {"samples": samples} if {"images", "points"} & set(replaced) else {}
         given |= {"steps": MORE_STEPS} if "steps" in replaced else {}
         self.params: dict[str, Any] = {**found.params, "oracle": given}
         self.given, self.trained_on = _recipe_method(base).given, found.trained_on

@@ -86,6 +86,8 @@ def patterns(
         model = method.fit(training_for(method, training), request)
     assert isinstance(model, FittedModel)
     gain, dark = (model.estimates[name].cpu().numpy().astype(np.float64) for name in ("gain", "dark"))
+    for old in (out / "errors.json", *out.glob("*.npz")):  # of another scene
+        old.unlink(missing_ok=True)
     for camera, g, d in zip(training.cameras, gain, dark, strict=True):
         with atomic_path(out / f"{camera.id}.npz") as part:
             np.savez(part, allow_pickle=False, gain=g.astype(np.float32), dark=d.astype(np.float32))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.generators.recorder.resources import real_time
 from spike4dgs.studies.kit.timing import show_table
 from spike4dgs.studies.recorder_runs import FRAME_BYTES, Load, Outcome, disk_rate, run
@@ -82,6 +83,8 @@ def record(
         disk: Folder for them; a temporary one if left out.
         csv: Also write the tables here, and with -disk behind the name.
     """
+    if cameras < 1:
+        raise problem("--cameras", "1 or more", str(cameras), "correct it")
     load = Load(cameras, fps, transfer_kib << 10, transfers, memory_kib << 10, buffer_s)
     mb_s = load.fps * FRAME_BYTES / 1e6
     title = f"emulated cameras of {mb_s:g} MB/s, {load.transfers} reads of {transfer_kib} KiB, {os.cpu_count()} cores"

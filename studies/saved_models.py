@@ -40,6 +40,8 @@ def render(
     """
     if not models:
         raise problem("speed render", "saved models", "none", "name OUT/models/METHOD/SCENE.safetensors of a run")
+    if times < 1:
+        raise problem("--times", "1 or more", str(times), "correct it")
     loaded = [load_model(path, device) for path in models]
     shots = [_shots(m, times, scale) for m in loaded]
     with one_torch_thread():

@@ -18,7 +18,7 @@ from spike4dgs.benchmark.files import read_json, write_text
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard.tracks import short
-from spike4dgs.studies.kit.blocks import table_rows, with_block
+from spike4dgs.studies.kit.blocks import read_page, table_rows, with_block
 from spike4dgs.studies.kit.timing import markdown, show_table, write_csv
 
 COLUMNS = (
@@ -57,6 +57,8 @@ def scene_noise(
     if not audited:
         expected, found = "reports of audited scenes", f"{len(reports)} reports without an audit" if reports else "none"
         raise problem(", ".join(map(str, folders)), expected, found, "make scenes with `make-dataset --audit`")
+    if page is not None:
+        read_page(page, "noise")  # before anything is written
     rows = [_row(report, folder / report["scene"]) for folder, report in audited]
     write_text(out / "noise.md", "\n".join([*markdown(COLUMNS, rows), ""]))
     write_csv(out / "noise.csv", COLUMNS, rows)
@@ -85,7 +87,7 @@ def _row(report: dict[str, Any], scene: Path) -> list[str]:
 
 def _write_page(page: Path, rows: Sequence[Sequence[str]]) -> None:
     """Put the rows into the page's block, in the order of the scenes' names."""
-    text = page.read_text(encoding="utf-8")
+    text = read_page(page, "noise")
     lines = {line.split(" | ")[0]: line for line in [*table_rows(text, "noise"), *markdown(COLUMNS, rows)[2:]]}
     shown = [*markdown(COLUMNS, []), *(lines[scene] for scene in sorted(lines))]
     write_text(page, with_block(text, "noise", shown))

@@ -51,6 +51,9 @@ def spike_agreement(
     console, scores, scenes = make_console(), Scores(), dict[str, Scene | None]()
     for folder in _prediction_folders(runs):
         name, method = folder.name, folder.parent.name
+        if method in scores.get(name, {}):
+            fix = "name one of the two runs"
+            raise problem(folder, f"one run of {method} on {name}", "another one", fix)
         try:
             if name not in scenes:
                 scenes[name] = None
@@ -78,6 +81,8 @@ def spike_agreement(
 
 def _prediction_folders(runs: Sequence[Path]) -> Iterator[Path]:
     for run in runs:
+        if not run.is_dir():
+            raise problem(run, "a folder of run-benchmark", "no such folder", "correct the name")
         yield from sorted(p for p in run.glob("predictions/*/*") if p.is_dir() and not p.name.startswith("."))
 
 

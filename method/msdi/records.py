@@ -1,17 +1,18 @@
-"""What a training leaves beside its weights: the curves of its course, and the model card."""
+"""What a training leaves beside its weights: the curves of its course, its shards, and the model card."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.environment import harness
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import atomic_path, write_text
+from spike4dgs.benchmark.files import atomic_path, read_json, write_json, write_text
+from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.benchmark.variants import HIDDEN_VARIANTS
 from spike4dgs.method.msdi.config import CONFIGS
 from spike4dgs.method.msdi.losses import TrainingSettings
@@ -32,7 +33,8 @@ class Curve:
         if path.is_file():
             try:
                 with open(path, newline="") as f:
-                    rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(f)]
+                    found = csv.DictReader(f)
+                    rows = [{name: float(value) for name, value in row.items() if value != ""} for row in found]
                 self.rows = [row for row in rows if row["step"] <= until_step]
             except (ValueError, KeyError, TypeError) as e:
                 raise problem(path, "a table of numbers", f"damaged text ({e})", "delete it") from None
@@ -43,11 +45,24 @@ class Curve:
 
     def write(self) -> None:
         """Write the file."""
-        text = io.StringIO()
-        writer = csv.DictWriter(text, list(self.rows[0]) if self.rows else ["step"], lineterminator="\n")
+        # Rows may have further columns, once there are shards to score.
+        text, names = io.StringIO(), dict.fromkeys(["step", *(name for row in self.rows for name in row)])
+        writer = csv.DictWriter(text, list(names), lineterminator="\n")
         writer.writeheader()
         writer.writerows({name: f"{value:.7g}" for name, value in row.items()} for row in self.rows)
         write_text(self.path, text.getvalue())
+
+
+def note_shards(path: Path, files: Sequence[BurstFile], earlier: Set[str], *, fresh: bool) -> tuple[str, ...]:
+    """Return the training's shards as ID@SHA256, with the `earlier` ones of its weights and those of its other starts.
+
+    They are kept in a file.
+    """
+    names = {f"{f.facts.id}@{f.sha256[:16]}" for f in files} | earlier
+    if path.is_file() and not fresh:
+        names |= set(read_json(path, "what was trained on")["shards"])
+    write_json(path, {"shards": sorted(names)})
+    return tuple(sorted(names))
 
 
 def plot_curves(path: Path, losses: Sequence[Row], scores: Sequence[Row]) -> None:

@@ -11,7 +11,7 @@ with the bits of a run that never stopped.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from spike4dgs.benchmark.environment import device_type
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, sha256_json, write_json, write_text
+from spike4dgs.benchmark.files import sha256_json, write_text
 from spike4dgs.benchmark.scene.training_bursts import BurstFile, open_folder
 from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import read_tensors
@@ -34,7 +34,7 @@ from spike4dgs.method.msdi.evaluate import Scores, evaluate
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import TrainingSettings, image_loss, point_loss
 from spike4dgs.method.msdi.network import Msdi, has_bfloat16
-from spike4dgs.method.msdi.records import Curve, model_card, plot_calibration, plot_curves
+from spike4dgs.method.msdi.records import Curve, model_card, note_shards, plot_calibration, plot_curves
 from spike4dgs.method.msdi.training_data import Batch, Bursts, check_ticks
 from spike4dgs.method.msdi.weights import WEIGHTS, Card
 
@@ -149,27 +149,34 @@ def checkpoint_key(settings: TrainingSettings, config: str, seed: int, start_sha
     return sha256_json([facts, config, seed, start_sha256])
 
 
-def start_from(network: Msdi, path: Path) -> None:
+def start_from(network: Msdi, path: Path) -> Set[str]:
     """Take the weights of an earlier training, or those of a file of Fast3R or DUSt3R, in place.
 
-    Raises UserError for a damaged file and for the weights of something else.
+    Return the shards that the earlier training saw, as ID@SHA256. Raises UserError for a damaged file and for the
+    weights of something else.
     """
     fix = "name a file that train-msdi wrote, or one of Fast3R or DUSt3R"
     state = read_tensors(path, "weights in safetensors format", fix)
     own = network.state_dict()
     if {n: t.shape for n, t in state.items()} == {n: t.shape for n, t in own.items()}:
         network.load_state_dict({name: tensor.float() for name, tensor in state.items()})
-    else:
-        transfer(network, state, path)
+        return frozenset(WEIGHTS.read_card(path).trained_on)
+    transfer(network, state, path)
+    return frozenset()
 
 
 class Run:
-    """A training with its files in the folder `out`, continued from its checkpoint."""
+    """A training with its files in the folder `out`, continued from its checkpoint.
 
-    def __init__(self, training: Training, hidden: list[BurstFile], key: str, out: Path) -> None:
+    `earlier`: the shards that the weights it began with were trained on.
+    """
+
+    def __init__(
+        self, training: Training, hidden: list[BurstFile], key: str, out: Path, earlier: Set[str] = frozenset()
+    ) -> None:
         self.training, self.key, self.out = training, key, out
         training.resume(self.checkpoint, key)
-        self.seen = _note_data(out / "trained_on.json", training.data.files, fresh=training.step == 0)
+        self.seen = note_shards(out / "trained_on.json", training.data.files, earlier, fresh=training.step == 0)
         ticks, most = training.network.config.ticks, training.settings.most_views
         self.hidden = Bursts(hidden).fixed(_SCORED_BURSTS, most, ticks) if hidden else []
         self.losses, self.scores = (Curve(out / f"{name}.csv", training.step) for name in ("losses", "scores"))
@@ -224,12 +231,3 @@ class Run:
         write_text(self.out / "README.md", model_card(card, training.settings, digest))
         shown = "".join(f", {n} {measured[n]:g}" for n in ("psnr_db", "tfp_psnr_db", "point_error") if n in measured)
         print(f"step {training.step}, written: {path}{shown}", flush=True)
-
-
-def _note_data(path: Path, files: list[BurstFile], *, fresh: bool) -> tuple[str, ...]:
-    """Return the training data as ID@SHA256, with those of earlier starts of the same training; keep them in a file."""
-    names = {f"{f.facts.id}@{f.sha256[:16]}" for f in files}
-    if path.is_file() and not fresh:
-        names |= set(read_json(path, "what was trained on")["shards"])
-    write_json(path, {"shards": sorted(names)})
-    return tuple(sorted(names))

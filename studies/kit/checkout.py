@@ -1,11 +1,20 @@
-"""The tests of a checkout, for reports that run them."""
+"""The code that a report runs: its digest, and the tests of a checkout."""
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
+from spike4dgs import baselines, benchmark, generators, method, studies
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.runs.method_code import sources_sha256
+
+
+@cache
+def code_now() -> str:
+    """Return a digest of all that a study runs: a commit tells of no edits, and an installation has none."""
+    return sources_sha256([baselines, benchmark, generators, method, studies])
 
 
 def find_checkout(command: str) -> Path:

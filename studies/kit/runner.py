@@ -18,6 +18,7 @@ from spike4dgs.benchmark.environment import command_line, cpu_name, environment,
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.studies.kit.checkout import code_now
 from spike4dgs.studies.kit.measurement import GROUPS, Measurement, Point, Request, Series
 from spike4dgs.studies.kit.timing import write_csv
 
@@ -30,7 +31,7 @@ def run_study(
 ) -> int:
     """Measure, and write OUT/index.html, OUT/speed_error.json and OUT/measurements/ID.csv; return 1 if one failed.
 
-    What OUT has of the same `options`, request, commit and machine is kept, unless it is measured `again`.
+    What OUT has of the same `options`, request, code and machine is kept, unless it is measured `again`.
     """
     from spike4dgs.studies.kit.page import write_page_of
 
@@ -38,7 +39,7 @@ def run_study(
     folder = out / "measurements"
     for m in measurements if again else ():
         (folder / f"{m.id}.json").unlink(missing_ok=True)
-    key = {**shared, **options, "commit": harness()["commit"]}
+    key = {**shared, **options, "code": code_now()}
     results = measure_all(measurements, request, folder, key, _say)
     started, finished = measured_from_to(results)
     report = {

@@ -34,6 +34,7 @@ from spike4dgs.method.matching.training.data import at_light, record, seen_by_ne
 from spike4dgs.method.matching.weights import WEIGHTS, load_matcher
 from spike4dgs.method.matching.window_inputs import light_of
 from spike4dgs.method.starts.structure_from_motion import map_views
+from spike4dgs.studies.kit.checkout import code_now
 from spike4dgs.studies.kit.timing import markdown, show_table, write_csv
 
 LIGHTS = (1.0, 1 / 4, 1 / 16)
@@ -81,6 +82,8 @@ def dark_poses(
 
 def resting_arrays(data: Path, count: int) -> list[tuple[BurstFile, int]]:
     """Return `count` arrays at rest of each shard of hidden variants. Raises UserError for a folder without any."""
+    if count < 1:
+        raise problem("--bursts", "1 or more", str(count), "correct it")
     files = [f for f in open_folder(data) if f.facts.hidden and f.facts.resting and f.facts.views > VIEWS]
     if not files:
         fix = "make them with `spike4dgs make-msdi-data --resting 16`"
@@ -114,7 +117,7 @@ def _resting(file: BurstFile, count: int) -> Sequence[int]:
 def _kept(file: BurstFile, number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
     """Return an array's rows: those in `folder` where the same code, weights and conditions made them."""
     path = folder / f"{file.facts.id}-{number}.json"
-    by = {"commit": harness()["commit"], "weights": WEIGHTS.in_use().sha256, "seed": seed}
+    by = {"code": code_now(), "shard": file.sha256, "weights": WEIGHTS.in_use().sha256, "seed": seed}
     by |= {"lights": list(LIGHTS), "ticks": list(TICKS)}
     if path.is_file() and (found := read_json(path, "the poses of an array")).get("by") == by:
         return list(found["rows"])

@@ -161,7 +161,11 @@ def measure_poses(scene: TrainingScene, images: Float32, name: str, seed: int, *
     true = {camera.id: camera for camera in scene.cameras}
     partners = [true[camera.id] for camera in found.cameras]
     ratios = [a.fx / b.fx for a, b in zip(found.cameras, partners, strict=True)]
-    return {**row, **pose_errors(found.cameras, partners).summary(), "focal_ratio": float(np.mean(ratios))}
+    try:
+        errors = pose_errors(found.cameras, partners).summary()
+    except UserError as e:  # all at one place: nothing aligns them
+        return {**row, "error": str(e)}
+    return {**row, **errors, "focal_ratio": float(np.mean(ratios))}
 
 
 def _texts(row: Row) -> list[str]:

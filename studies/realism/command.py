@@ -23,7 +23,7 @@ from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_fi
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import open_stream
 from spike4dgs.generators.sensor.model import Sensor
-from spike4dgs.studies.kit.blocks import with_block
+from spike4dgs.studies.kit.blocks import read_page, with_block
 from spike4dgs.studies.kit.timing import markdown, write_csv
 from spike4dgs.studies.realism import windows as w
 from spike4dgs.studies.realism.classifier import FOLDS, auc_interval, out_of_fold, single_aucs, tiles
@@ -115,6 +115,8 @@ def realism(
         out: Folder for the results.
         page: Results page whose block `<!-- realism -->` is written anew.
     """
+    if page is not None:
+        read_page(page, "realism")  # before the work
     stream = open_stream(recording, width, height, w.RATE_HZ)
     if stream.n_ticks < 2 * w.TICKS:
         raise problem(recording, f"{2 * w.TICKS} ticks or more", f"{stream.n_ticks}", "give a longer recording")
@@ -148,7 +150,7 @@ def realism(
     write_plot(out / "realism.png", report)
     print(text)
     if page is not None:
-        write_text(page, with_block(page.read_text("utf-8"), "realism", [text]))
+        write_text(page, with_block(read_page(page, "realism"), "realism", [text]))
     return 0
 
 

@@ -104,12 +104,14 @@ def home_block(records: Sequence[Record]) -> list[str]:
 
 
 def of_group(group: Group, records: Iterable[Record]) -> list[Record]:
-    """Return the records of a group's cells, failed ones too."""
-    budget, names = make_budget(group.budget).label, {row.name for row in group.rows}
+    """Return the records of a group's cells, failed ones too; further seeds are of other groups."""
+    budget, seeds = make_budget(group.budget).label, {row.name: row.seeds for row in group.rows}
     return [
         r
         for r in records
-        if r["row"] in names and r["scene"] in group.scenes and (r["budget"], r["split"]) == (budget, group.split)
+        if r["seed"] < seeds.get(r["row"], 0)
+        and r["scene"] in group.scenes
+        and (r["budget"], r["split"]) == (budget, group.split)
     ]
 
 
@@ -179,8 +181,11 @@ def _time(row: MeasuredRow, name: str) -> str:
 
 
 def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = BOTH) -> str:
-    """Return metrics of a scene, means over seeds; "-" where there are none."""
-    cells = [r["metrics"] for (s, _), r in row.cells.items() if s == scene]
+    """Return metrics of a scene, means over seeds; "-" where there are none.
+
+    Of a complete row, over those seeds that its means are of.
+    """
+    cells = [r["metrics"] for (s, seed), r in row.cells.items() if s == scene and seed in (row.seeds or [seed])]
     means = []
     for metric in metrics:
         known = [m[metric] for m in cells if metric in m]

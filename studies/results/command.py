@@ -87,6 +87,9 @@ def results(
     root = find_root()
     folder = root / "studies" / "results" / "records" if records is None else records
     if write or check:
+        if choice != Choice():
+            expected, fix = "neither --write nor --check beside options of a sweep", "leave one of them out"
+            raise problem("report results", expected, "both", fix)
         known = list(read_records(folder).values())
         if write:
             _write(root, known)

@@ -27,6 +27,7 @@ KNOWLEDGE = {  # the blocks of a table, in their order -> what its rows are give
 OUR_TRIALS = "release 1, variants 0"
 FEW_TRIALS = "release 1, variants 0, few trials"  # motions of other people: steps for the budget, rates to match
 NOT_TUNED = "not tuned"
+CEILING = "truth.noise"  # the row of the scores that the truth's noise allows
 
 
 @dataclass(frozen=True)

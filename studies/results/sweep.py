@@ -27,7 +27,7 @@ from spike4dgs.benchmark.runs.run import JobFiles, Settings, check_inputs, run_c
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.reading import typical_fit_seconds
 from spike4dgs.studies.results.code_state import CodeState, code_digest
-from spike4dgs.studies.results.plan import Cell, knowledge_of
+from spike4dgs.studies.results.plan import CEILING, Cell, knowledge_of
 from spike4dgs.studies.results.records import (
     DIGITS,
     FAILED,
@@ -41,7 +41,6 @@ from spike4dgs.studies.results.records import (
     write_row,
 )
 from spike4dgs.studies.results.scenes import revisions_of
-from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
 from spike4dgs.studies.results.tables.ceilings import measure_ceiling
 from spike4dgs.studies.results.tables.images import SUFFIX as IMAGES
 from spike4dgs.studies.results.tables.images import measure_images

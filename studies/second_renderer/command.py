@@ -21,6 +21,7 @@ from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, SPLIT_PROFILES
 from spike4dgs.generators.render_tasks import cameras_of, renderer_of, world_of
 from spike4dgs.generators.rendering.render import MultiViewRenderer
 from spike4dgs.generators.worlds import WORLDS, WorldScene
+from spike4dgs.studies.kit.checkout import code_now
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.second_renderer.checks import BOTH, CHECKS, NATIVE, PLAIN, WHOLE, Check
 from spike4dgs.studies.second_renderer.comparison import compare, kinds, ratios
@@ -38,7 +39,7 @@ class Study:
     job: Job
     folder: Path
     samples: int
-    commit: str
+    code: str  # a digest of it
 
     @property
     def world(self) -> WorldScene:
@@ -56,7 +57,7 @@ class Study:
 
     def kept(self, name: str, make: Any, *arguments: Any) -> Float32:
         """Return the images of this name, which `make` of the arguments renders if they are not there yet."""
-        key = {"job": self.job.settings, "tick": _TICK, "samples": self.samples, "commit": self.commit, "name": name}
+        key = {"job": self.job.settings, "tick": _TICK, "samples": self.samples, "code": self.code, "name": name}
         return kept(self.folder / f"{name}.npz", key, partial(make, *arguments))
 
 
@@ -85,7 +86,7 @@ def second_renderer(
     profile = SPLIT_PROFILES[_PROFILE]
     for name in worlds:
         job = Job(name, _VARIANT, 0, _PROFILE, profile, profile.seconds)
-        record, row = measure(Study(job, out / "renderings" / name, samples, harness()["commit"]), blender)
+        record, row = measure(Study(job, out / "renderings" / name, samples, code_now()), blender)
         records.append(record)
         rows.append(row)
     report = {

@@ -22,11 +22,14 @@ from typing import Any
 from rich.console import Console
 from tyro.conf import Positional
 
+from spike4dgs import baselines, benchmark
+from spike4dgs import method as method_room
 from spike4dgs.baselines import recipes as theirs
-from spike4dgs.benchmark.environment import command_line, cpu_name, harness, utc_now
+from spike4dgs.benchmark.environment import command_line, cpu_name, device_type, harness, utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, choose_device_for, get_method, make_budget
+from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
@@ -85,6 +88,8 @@ def tuning(
             "scenes": {scene.id: scene.revision for scene in opened},
             "budget": make_budget(budget).label,
             "seed": seed,
+            "device": device_type(chosen),
+            "code": sources_sha256([benchmark, method_room, baselines]),
         }
         search(method, opened, out / f"{method.name}.json", about, trials, _fit_by(seed, chosen, budget), print)
         write_results(out)

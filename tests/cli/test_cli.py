@@ -275,3 +275,18 @@ def test_a_working_folder_whose_name_is_no_text_is_named(tmp_path: Path) -> None
     done = python("-m", "spike4dgs.cli", "doctor", cwd=folder)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert done.stderr.startswith("error: working folder: expected a name in UTF-8") and r"/in\xff'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("speed images --repeats 0", "--repeats"),
+        ("speed render model.safetensors --times 0", "--times"),
+        ("speed record --cameras 0", "--cameras"),
+        ("report dark-poses . --bursts 0", "--bursts"),
+        ("report dark-points . --bursts -1", "--bursts"),
+    ],
+)
+def test_counts_of_nothing_are_one_error(command: str, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command.split()) == 2
+    assert f"error: {option}: expected 1 or more, found" in capsys.readouterr().err

@@ -225,8 +225,11 @@ def test_a_track_and_table_6_are_modes_of_their_own(
     options = {"data": small_scene.parent, "methods": ("counts",), "device": "cpu", "metrics": ("psnr",)}
     assert run_here(track="moon", out=out, **options) == 0
     assert (out / "leaderboard/local").is_dir(), "the scenes of the track are those in the folder"
-    with pytest.raises(UserError, match="--track: expected neither scenes nor a table beside it, found --table 1"):
-        run_benchmark(track="moon", table=1)
+    for table in (1, 6):
+        with pytest.raises(UserError, match=f"--track: expected neither scenes nor a table .*, found --table {table}"):
+            run_benchmark(track="moon", table=table)
+    with pytest.raises(UserError, match="--methods: expected no --table 6 beside it, which fits nothing"):
+        run_benchmark(table=6, methods=("counts",))
 
 
 @pytest.mark.parametrize("options", [["--oracle"], ["--oracle-samples", "64"]])

@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_json, files_in
 from skimage.metrics import peak_signal_noise_ratio
 
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -67,6 +69,38 @@ def test_a_table_of_two_captures(tiny_data: Path, out: Path, monkeypatch: pytest
     before = model.stat().st_mtime_ns
     assert main(command) == 0
     assert model.stat().st_mtime_ns == before, "finished fits are kept"
+
+
+def test_captures_of_another_scene_seed_or_budget_are_not_taken_for_these(
+    tiny_data: Path, out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fault_table, "CASES", CASES[:1])
+    command = ["fault-table", str(tiny_data / "car-0-tiny"), *COMMAND, "--out", str(out)]
+    before = files_in(out)
+    for options, what in ((["--seed", "1"], "seed"), (["--budget", "1"], "budget")):
+        assert main([*command, *options]) == 2
+        assert f"expected captures and fits of this {what}, found those of another" in capsys.readouterr().err
+    assert files_in(out) == before
+    edit_json(out / "about.json", lambda about: about.update(scene="0" * 64))
+    assert main(command) == 2 and "of this scene, found" in capsys.readouterr().err
+
+
+def test_a_fit_that_was_refused_is_tried_again(
+    tiny_data: Path, out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fault_table, "CASES", CASES[:1])
+    kept = out / "fits/none/tfp+static/scores.json"
+    kept.unlink()
+    command = ["fault-table", str(tiny_data / "car-0-tiny"), *COMMAND, "--out", str(out)]
+    with monkeypatch.context() as patch:
+        patch.setattr(fault_table, "fit_recording", lambda *_: refuse())
+        assert main(command) == 0
+    assert "no weights" in (out / "table.csv").read_text() and not kept.exists()
+    assert main(command) == 0 and kept.exists()
+
+
+def refuse() -> None:
+    raise UserError("no weights")
 
 
 def test_rows_of_the_lens_show_the_scene_that_was_made_with_it(

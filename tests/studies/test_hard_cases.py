@@ -82,6 +82,16 @@ def test_lack(hard_case):
     pytest.skip("no such camera")
 
 
+@pytest.fixture
+def broken():
+    raise OSError("no space left")
+
+
+@mark()
+def test_early(broken, hard_case):
+    hard_case.check(0, "never")
+
+
 @mark()
 def test_infinite(hard_case):
     hard_case.check(np.inf, "inf")
@@ -123,6 +133,12 @@ def report(checkout: Path, out: Path, **options: Any) -> tuple[subprocess.Comple
 def whole(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, dict[str, Any]]:
     out = tmp_path_factory.mktemp("report")
     return out, *report(checkout, out, seed=5)
+
+
+def test_a_test_that_dies_before_its_case_is_exit_1(checkout: Path, tmp_path: Path) -> None:
+    done, found = report(checkout, tmp_path, only="early or resume")
+    assert done.returncode == 1 and "a test failed before it told of its case" in done.stderr
+    assert [c["passed"] for c in found["cases"]] == [True]
 
 
 def test_every_case_is_a_row_and_one_that_fails_is_exit_1(whole: tuple[Path, Any, dict[str, Any]]) -> None:

@@ -116,6 +116,8 @@ def test_images_are_scored_again_where_the_camera_is_known(tmp_path: Path, monke
     found = images.mean_over_scenes(row.corrected, "psnr")
     assert found == pytest.approx(np.mean(expected), abs=1e-3)
     assert found != pytest.approx(images.mean_over_scenes(row.quality, "psnr"), abs=0.01)
+    without = open_scene(write_small_scene(tmp_path / "t", seed=1))
+    assert not images.measure_maker("tfp", TFP, [scene, without], 1).corrected, "no mean over fewer scenes beside one"
 
 
 def test_a_strip_of_images_for_each_scene(measured: Path) -> None:

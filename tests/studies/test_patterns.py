@@ -67,6 +67,8 @@ def with_recordings(scene: Path) -> TrainingScene:
 @pytest.mark.parametrize("recorded", [False, True])
 def test_command_writes_maps_and_their_errors(recorded, small_scene: Path, tmp_path, capsys, monkeypatch) -> None:
     scene = with_recordings(small_scene) if recorded else open_scene(small_scene).training
+    for old in ("errors.json", "cam_77.npz"):  # of another scene
+        (tmp_path / old).touch()
     monkeypatch.setattr(pattern_report, "open_scene", lambda *_: SimpleNamespace(training=scene))
     assert main(["patterns", str(small_scene), "--budget", "0.01", "--out", str(tmp_path)]) == 0
     gain, dark = [], []
@@ -77,7 +79,7 @@ def test_command_writes_maps_and_their_errors(recorded, small_scene: Path, tmp_p
     assert np.stack(gain).shape == (len(scene.cameras), scene.cameras[0].height, scene.cameras[0].width)
     assert np.stack(gain).mean(axis=(1, 2)) == pytest.approx(1, abs=1e-5)
     assert (tmp_path / "gain.png").read_bytes()[:4] == b"\x89PNG"
-    assert (tmp_path / "errors.json").exists() == recorded
+    assert (tmp_path / "errors.json").exists() == recorded and not (tmp_path / "cam_77.npz").exists()
     if recorded:
         rows = json.loads((tmp_path / "errors.json").read_text())
         expected = pattern_errors(np.stack(gain), np.stack(dark), scene.calibrations)

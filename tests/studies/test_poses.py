@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from spike4dgs.cli import main
 from spike4dgs.method.msdi.training_data import points_of
 from spike4dgs.method.starts.msdi import Estimate, shrunk
 from spike4dgs.method.starts.structure_from_motion import clip_means
+from spike4dgs.studies.poses import estimators
 from spike4dgs.studies.poses.estimators import measure_poses, poses
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)
@@ -32,6 +35,15 @@ def test_failures_are_rows_with_reasons(monkeypatch: pytest.MonkeyPatch) -> None
     dark = 0 * clip_means(WORLD.training)
     row = measure_poses(WORLD.training, dark, "colmap", 0, calibrated=True)
     assert row["registered"] == "0 of 8" and row["error"] == "fewer than two views have poses"
+
+
+def test_cameras_at_one_place_are_a_row_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = WORLD.training.cameras[0]
+    alike = tuple(replace(first, id=camera.id) for camera in WORLD.training.cameras)
+    found = SimpleNamespace(cameras=alike, points=np.zeros((0, 3)))
+    monkeypatch.setitem(estimators.ESTIMATORS, "rig", lambda *_: found)
+    row = measure_poses(WORLD.training, clip_means(WORLD.training), "rig", 0, calibrated=True)
+    assert row["registered"] == "8 of 8" and row["rotation_deg"] is None and "different positions" in str(row["error"])
 
 
 def test_command_prints_and_writes_the_table(

@@ -50,6 +50,17 @@ def test_a_page_keeps_the_rows_of_other_scenes(small_scene, tmp_path):
     assert rows == sorted([*others, new])
 
 
+@pytest.mark.parametrize("text", [None, b"no block\n", b"<!-- noise -->\n\xe4\n<!-- end noise -->\n"])
+def test_a_page_without_the_block_is_refused_before_the_work(small_scene, tmp_path, text):
+    page = tmp_path / "page.md"
+    if text is not None:
+        page.write_bytes(text)
+    report(small_scene.parent, small_scene.name, _AUDIT)
+    with pytest.raises(UserError, match=r"page\.md: expected"):
+        scene_noise((small_scene.parent,), out=tmp_path / "out", page=page)
+    assert not (tmp_path / "out").exists()
+
+
 def test_folders_without_an_audit_are_refused(tmp_path):
     with pytest.raises(UserError, match="expected reports of audited scenes, found none; "):
         scene_noise((tmp_path,), out=tmp_path / "out")

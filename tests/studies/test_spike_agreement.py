@@ -71,5 +71,17 @@ def test_runs_without_predictions_are_said(tmp_path: Path, capsys: pytest.Captur
     assert "expected predictions/METHOD/SCENE of scenes with ground truth" in capsys.readouterr().err
 
 
+def test_a_method_of_two_runs_and_a_folder_that_is_not_there_are_refused(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.move(small_scene, tmp_path / "pattern-0")
+    run(tmp_path / "run", [tmp_path / "pattern-0"], CountMethod("fine"))
+    command = ["spike-agreement", str(tmp_path / "run"), "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    twice = "expected one run of fine on pattern-0, found another one"
+    for second, message in (("run", twice), ("typo", "no such folder")):
+        assert main([*command[:2], str(tmp_path / second), *command[2:]]) == 2
+        assert message in capsys.readouterr().err
+
+
 def test_scores_of_the_moving_region_stand_beside_the_psnr_of_it() -> None:
     assert [partner(m) for m in ("spike_psnr_5", "spike_deviance_dynamic")] == ["psnr", "psnr_dynamic"]

@@ -26,9 +26,8 @@ from spike4dgs.method.image_network.config import MOVING_LOSS, ImageConfig, Imag
 from spike4dgs.method.image_network.network import ImageNetwork, log_mse
 from spike4dgs.method.image_network.training.data import ImageBatch, draw
 from spike4dgs.method.image_network.weights import WEIGHTS
-from spike4dgs.method.matching.training.train import note_shards
 from spike4dgs.method.models.network_weights import ConfigCard
-from spike4dgs.method.msdi.records import Curve
+from spike4dgs.method.msdi.records import Curve, note_shards
 
 ROW_EVERY = 100  # steps between rows of the losses
 _SAVE_EVERY_S = 60.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from spike4dgs.benchmark.files import read_json, sha256_json, write_json
+from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import Adam
@@ -27,7 +27,7 @@ from spike4dgs.method.matching.training.data import draw
 from spike4dgs.method.matching.training.losses import MatchLosses, match_losses
 from spike4dgs.method.matching.weights import WEIGHTS
 from spike4dgs.method.models.network_weights import ConfigCard
-from spike4dgs.method.msdi.records import Curve
+from spike4dgs.method.msdi.records import Curve, note_shards
 from spike4dgs.method.torch_state import one_torch_thread, seeded
 
 ROW_EVERY = 50  # steps between rows of the losses
@@ -147,15 +147,3 @@ def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s:
             WEIGHTS.save(out / "matcher.safetensors", training.network, ConfigCard(config, step, training.seed, seen))
             curve.write()
             saved = now
-
-
-def note_shards(path: Path, files: Sequence[BurstFile], earlier: Set[str], *, fresh: bool) -> tuple[str, ...]:
-    """Return the training's shards as ID@SHA256, with the `earlier` ones of its weights and those of its other starts.
-
-    They are kept in a file.
-    """
-    names = {f"{f.facts.id}@{f.sha256[:16]}" for f in files} | earlier
-    if path.is_file() and not fresh:
-        names |= set(read_json(path, "what was trained on")["shards"])
-    write_json(path, {"shards": sorted(names)})
-    return tuple(sorted(names))

@@ -11,10 +11,8 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.generators.truth import second_renderings
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
-from spike4dgs.studies.results.plan import UNCALIBRATED
+from spike4dgs.studies.results.plan import CEILING, UNCALIBRATED
 from spike4dgs.studies.results.records import COSTS, Record, short
-
-ROW = "truth.noise"
 
 
 def measure_ceiling(scene: Scene) -> Record:
@@ -36,4 +34,4 @@ def measure_ceiling(scene: Scene) -> Record:
 
 def ceiling_row(scenes: Sequence[str], records: Iterable[Record]) -> MeasuredRow:
     """Return the ceilings of scenes as a row."""
-    return rows_of([ROW], scenes, records)[0]
+    return rows_of([CEILING], scenes, records)[0]

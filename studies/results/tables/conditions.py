@@ -19,9 +19,8 @@ from spike4dgs.generators.worlds import HARD
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance, psnr_texts
 from spike4dgs.studies.results.comparison import BOTH, MeasuredRow, rows_of
-from spike4dgs.studies.results.plan import NOT_TUNED, OUR_TRIALS, Group, Row
+from spike4dgs.studies.results.plan import CEILING, NOT_TUNED, OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
-from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
 from spike4dgs.studies.results.tables.ceilings import ceiling_row
 
 WORLDS = ("car-1", "turntable-2")

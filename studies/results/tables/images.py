@@ -106,8 +106,9 @@ def _scores(row: MeasuredRow) -> list[str]:
 
 
 def _ms(row: MeasuredRow) -> str:
-    fps = row.mean_cost("render_fps")
-    text = "-" if not fps else f"{1000 / fps:.2g}" if fps > 100 else f"{1000 / fps:.0f}"
+    times = [1000 / fps for r in row.cells.values() if (fps := r["render_fps"])]
+    ms = sum(times) / max(len(times), 1)
+    text = "-" if not times else f"{ms:.2g}" if ms < 10 else f"{ms:.0f}"
     return text if row.is_quiet else f"({text})"
 
 

@@ -53,7 +53,8 @@ def noisy_block(records: Sequence[Record]) -> list[str]:
     noisy = [row for row in rows_of(names, NOISY.scenes, own) if row.is_complete]
     if not noisy:
         return [NOTHING]
-    before = rows_of([row.name for row in noisy], [scene.removesuffix(NOISE) for scene in NOISY.scenes], records)
+    scenes = [scene.removesuffix(NOISE) for scene in NOISY.scenes]
+    before = rows_of([row.name for row in noisy], scenes, of_group(GROUP, records))
     lines = [[f"`{a.name}`", both_text(b), change_text(a, b)] for a, b in zip(noisy, before, strict=True)]
     legend = "PSNR of the whole image / where things move, dB, on car. The cells without noise are of the table above."
     return [*markdown(("row", "without noise", "with it"), lines), "", legend, "", provenance(own, NOISY)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import fmean
 
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -10,7 +11,7 @@ from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published, 
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, change_text, of_group, provenance
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, differences, rows_of
-from spike4dgs.studies.results.plan import TABLE1, TABLE5, UNPOSED, Group
+from spike4dgs.studies.results.plan import TABLE1, TABLE5, UNPOSED, Group, once
 from spike4dgs.studies.results.records import Record
 
 _METRICS = {"psnr": 2, "ssim": 4}  # both in the paper and in records -> digits
@@ -81,7 +82,9 @@ def unposed_block(records: Sequence[Record]) -> list[str]:
     if not rows:
         return [NOTHING]
     partners = {row.name: given_row(row.name) for row in rows}
-    given = {row.name: row for row in rows_of(partners.values(), TABLE1.scenes, of_group(TABLE1, records))}
+    beside = replace(TABLE1, rows=once(dict.fromkeys(partners.values())))  # the same seed
+    others = of_group(beside, records)
+    given = {row.name: row for row in rows_of(partners.values(), TABLE1.scenes, others)}
     rows.sort(key=lambda row: -(row.mean(RANKED_BY) or 0.0))
     lines = []
     for row in rows:
@@ -89,7 +92,7 @@ def unposed_block(records: Sequence[Record]) -> list[str]:
         texts = both_text(row), f"{row.mean('ssim'):.4f}", f"`{partner.name}`", change_text(row, partner)
         lines.append([f"`{row.name}`", *texts])
     heads = ("row", "PSNR / moving", "SSIM", "given poses", "change of PSNR / moving, dB")
-    return [*markdown(heads, lines), "", provenance(own, UNPOSED)]
+    return [*markdown(heads, lines), "", provenance([*own, *others], UNPOSED, beside)]
 
 
 def views_block(records: Sequence[Record]) -> list[str]:

@@ -178,6 +178,9 @@ def test_curves_drop_rows_that_a_resumed_training_repeats(tmp_path: Path) -> Non
     again = Curve(tmp_path / "c.csv", 100)
     assert [row["step"] for row in again.rows] == [50, 100]
     assert again.rows[1]["total"] == pytest.approx(100 / 7, rel=1e-6)
+    again.add(150, {"total": 2.0, "psnr_db": 30.0})  # as soon as there are shards to score
+    again.write()
+    assert Curve(tmp_path / "c.csv", 150).rows == [*again.rows[:2], {"step": 150, "total": 2, "psnr_db": 30}]
     (tmp_path / "c.csv").write_text("step,total\n1,x\n")
     with pytest.raises(UserError, match="expected a table of numbers, found damaged text"):
         Curve(tmp_path / "c.csv", 100)
@@ -210,6 +213,12 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
     before = path.read_bytes()
     assert train_msdi(**arguments) == 0  # type: ignore[arg-type]
     assert path.read_bytes() == before  # done already
+
+    write_toy_shard(tmp_path / "more", 15)
+    begun = {**arguments, "data": tmp_path / "more", "out": tmp_path / "begun", "start": path}
+    assert train_msdi(**begun) == 0  # type: ignore[arg-type]
+    seen = WEIGHTS.read_card(tmp_path / "begun/msdi-tiny.safetensors").trained_on
+    assert set(seen) > set(card.trained_on) and any(name.startswith("toy-15@") for name in seen)
 
     network = Msdi(TINY)
     start_from(network, path)

@@ -200,6 +200,19 @@ def test_seeds_that_not_every_scene_has_do_not_count() -> None:
     assert row.seeds == (0, 2) and row.mean("psnr_dynamic") == pytest.approx(31)
 
 
+def test_a_table_has_the_seeds_of_its_plan() -> None:
+    """A row that has three seeds for another table has one beside rows of one."""
+    one = replace(GROUP, rows=tuple(replace(row, seeds=1) for row in GROUP.rows))
+    text = table_block(one, [*made(), *(record("a", s, 99.0, seed=1) for s in SCENES)])
+    assert text == table_block(one, [r for r in made() if r["seed"] == 0]) and "seed 0;" in text[-1]
+
+
+def test_a_seed_that_few_scenes_have_is_on_no_scene() -> None:
+    seeds = replace(GROUP, rows=(replace(Row("a"), seeds=2), *GROUP.rows[2:]))
+    with_more = [*made(), record("a", SCENES[0], 99.0, seed=1)]
+    assert scenes_block(seeds, with_more) == scenes_block(seeds, made())
+
+
 def test_other_code_commits_and_changes_are_named() -> None:
     def last(**changes: Any) -> str:
         return table_block(
@@ -270,6 +283,10 @@ def test_estimated_poses_stand_beside_given_ones_where_both_are_measured():
         "| `tfp+colmap+stg` | 31.50 / 29.50 | 0.9700 | `tfp+stg` | -0.50 / -0.50 |",
         "| `tfi+colmap+stg` | 30.00 / 28.00 | 0.9700 | `tfi+stg` | - |",
     ]
+    others = [record("spike4dgs", s, 50.0, seed=1) for s in TABLE1.scenes]
+    given = [{**r, "commit": "decade000000"} if r["row"] == "tfp+stg" else r for r in [*found, *others]]
+    assert unposed_block(given)[2:5] == unposed_block(found)[2:5], "the same seed beside"
+    assert unposed_block(given)[-1].startswith("Commits c0ffee000000, decade000000;")
 
 
 def test_table_5_has_a_column_for_each_number_of_views():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import pytest
 from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.studies.results import code_state
+from spike4dgs.studies.results.plan import CEILING
 from spike4dgs.studies.results.tables.ceilings import measure_ceiling
 
 STILL, MOVING = 0.02, 0.04  # standard deviations of the noise that is added
@@ -30,6 +33,21 @@ def test_noise_of_a_known_size_in_the_truth_is_the_ceiling(tiny_data: Path, tmp_
     assert found["error"] is None
     assert found["metrics"]["psnr"] == pytest.approx(-10 * np.log10(squares.mean()), abs=0.5)
     assert found["metrics"]["psnr_dynamic"] == pytest.approx(-10 * np.log10(squares[moving].mean()), abs=0.8)
+
+
+def test_a_ceilings_code_is_the_renderers(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed: list[list[str]] = []
+
+    def note(packages: list[ModuleType]) -> str:
+        hashed.append([package.__name__ for package in packages])
+        return "0" * 64
+
+    monkeypatch.setattr(code_state, "sources_sha256", note)
+    for row in (CEILING, "tfp+stg"):
+        code_state.code_digest(row)
+    ceiling, baseline = hashed
+    assert "spike4dgs.generators" in ceiling and "spike4dgs.baselines" not in ceiling
+    assert "spike4dgs.baselines" in baseline and "spike4dgs.generators" not in baseline
 
 
 def test_a_scene_that_no_world_made_is_skipped(small_scene: Path) -> None:

@@ -10,7 +10,7 @@ from made_records import record
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.studies.results import code_state
 from spike4dgs.studies.results.blocks import NOTHING
-from spike4dgs.studies.results.command import results
+from spike4dgs.studies.results.command import Choice, results
 from spike4dgs.studies.results.loose_figures import counts, loose_figures, read_ratchet, risen
 from spike4dgs.studies.results.pages import outdated, with_blocks, write_pages
 from spike4dgs.studies.results.plan import TABLE1
@@ -96,6 +96,11 @@ def test_the_command_checks_and_writes_and_its_ratchet_only_falls(
     assert results(check=True, write=True, records=records) == 1
     assert "more figures outside generated blocks: docs/results/page.md: 2, 1 allowed" in capsys.readouterr().err
     assert read_ratchet(checkout) == {"docs/results/page.md": 1}
+
+
+def test_options_of_a_sweep_are_refused_beside_pages(checkout: Path) -> None:
+    with pytest.raises(UserError, match="neither --write nor --check beside options of a sweep"):
+        results(write=True, choice=Choice(only=("table1",)), records=checkout / "records")
 
 
 def test_pages_are_written_where_they_change_alone(checkout: Path) -> None:
