@@ -145,6 +145,13 @@ def _reference(job: Job, renderer: WholePaths, spp: int) -> Callable[[float], ND
     return (lambda t_s: renderer.reference_frames(t_s, spp)) if ideal else loaded(0.0).crn_frames
 
 
+def lit_pairs(job: Job) -> list[tuple[int, int]]:
+    """Return pairs of targets a millisecond apart at which there is light, by which their truth is divided."""
+    lit = [t for t in job.target_ticks if job.light_at(t) > 0]
+    first = lit[:: max(1, len(lit) // _PAIRS)][:_PAIRS]
+    return [(t, t + TARGET_EVERY) for t in first if t + TARGET_EVERY in lit]
+
+
 def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, dict[str, float | None]]:
     """Return the noise of the held-out camera's radiance ("streams") and ground truth ("truth"): PSNR in dB, ceilings.
 
@@ -154,9 +161,7 @@ def noise(job: Job, store: KeyStore, plan: KeyPlan, scene: Path) -> dict[str, di
     """
     view = held_out_view(job)
     camera = cameras_of(job)[view]
-    lit = [t for t in job.target_ticks if job.light_at(t) > 0]
-    first = lit[:: max(1, len(lit) // _PAIRS)][:_PAIRS]
-    pairs = [(t, t + TARGET_EVERY) for t in first if t + TARGET_EVERY in lit]
+    pairs = lit_pairs(job)
     ticks = sorted({t for pair in pairs for t in pair})
     own = [second_truth(job, view, job.seed + seed) for seed in _SEEDS]
     objects = renderer_of(job, [camera], truth=True)

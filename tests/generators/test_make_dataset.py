@@ -135,6 +135,25 @@ def test_scenes_of_one_rendering_are_rendered_once_and_equal_those_made_alone(fa
     assert not (tmp_path / "together" / ".work").exists()
 
 
+def test_streams_of_a_scene_that_was_begun_alone_are_not_those_of_the_next(fake, monkeypatch, tmp_path):
+    """A rendering is shared as far as it is one: no stream of the scene's own light."""
+    settings, simulate, written = SceneSettings(profile="tiny"), streams.write_camera, []
+
+    def cut(scene, job, *others):
+        if written:
+            raise Stop
+        written.append(simulate(scene, job, *others))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(streams, "write_camera", cut)
+        with pytest.raises(Stop):
+            make_dataset([settings.job("car")], tmp_path / "begun")
+    dim = SceneSettings(profile="tiny", physics=physics_of("light=0.25")).job("car")
+    command(("car",), settings=settings, also=("light=0.25",), out=tmp_path / "begun")
+    make_dataset([dim], tmp_path / "alone")
+    assert files_in(tmp_path / "begun" / dim.id) == files_in(tmp_path / "alone" / dim.id)
+
+
 def test_what_changes_the_radiance_is_rendered_anew_and_a_killed_run_goes_on_with_what_is_shared(
     fake, monkeypatch, tmp_path
 ):

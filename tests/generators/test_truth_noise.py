@@ -9,11 +9,13 @@ import pytest
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.cli.make_dataset import physics_of
 from spike4dgs.generators import truth as renderings
+from spike4dgs.generators.make_dataset import SceneSettings
 from spike4dgs.generators.profiles import RATE_HZ, SPLIT_PROFILES, Job
 from spike4dgs.generators.render_tasks import RenderTargets, cameras_of, renderer_of
 from spike4dgs.generators.rendering.keyframes import finite
-from spike4dgs.generators.truth import second_renderings, second_truth
+from spike4dgs.generators.truth import lit_pairs, second_renderings, second_truth
 from spike4dgs.leaderboard.truth_check import noise_ceiling_db, noise_share
 
 
@@ -59,6 +61,16 @@ def test_a_pixel_that_is_no_number_once_is_rendered_again(capsys: pytest.Capture
 
 
 @pytest.mark.slow
+def test_noise_is_measured_where_there_is_light() -> None:
+    """An LED that is dark half of the time: its truth is divided by the light."""
+    settings = SceneSettings("small", physics=physics_of("flicker=1 flicker-duty=0.5"))
+    job = settings.job("car")
+    pairs = lit_pairs(job)
+    assert pairs and all(job.light_at(t) > 0 for pair in pairs for t in pair)
+    assert any(job.light_at(t) == 0 for t in job.target_ticks)
+    assert len(lit_pairs(SceneSettings("small").job("car"))) == 3
+
+
 def test_a_second_truth_with_the_seed_of_the_first_equals_it() -> None:
     """So the two differ in random numbers alone, where views share maps of soft light."""
     profile = replace(SPLIT_PROFILES["tiny"], views=(2, 4), target_spp=16)
