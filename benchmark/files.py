@@ -229,7 +229,7 @@ def _check_lock(file: Path) -> None:
         raise problem(file, "a plain file, which is the folder's lock", found, "remove it")
 
 
-_PART = re.compile(r"\..+\.[0-9]+\.part(\.[^.]+)?")  # as in `atomic_path` and `SpikeWriter`
+_PART = re.compile(r"\..+\.[0-9]+\.part(\.[^.]+)?(\.mode)?")  # as in `atomic_path` and `SpikeWriter`
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:

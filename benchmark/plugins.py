@@ -45,6 +45,11 @@ def find_plugins(
     return plugins
 
 
+def is_distributed(group: str, name: str) -> bool:
+    """Return whether an installed package registers a name in a group: every process of this Python finds it."""
+    return any(entry.dist and name in entry.load() for entry in entry_points(group=group))
+
+
 def source_of(entry: EntryPoint) -> str:
     """Return the words for an error by which a user finds an entry point."""
     package = f"{entry.dist.name} {entry.dist.version}, " if entry.dist else ""

@@ -12,7 +12,7 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import write_json, write_text
+from spike4dgs.benchmark.files import locked, remove_parts, write_json, write_text
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.generators.recorder.rig_calibration.array_calibration import (
     ArrayCalibration,
@@ -71,9 +71,11 @@ def calibrate_rig(
         **_results(found),
         "against_clip": differences(found.cameras, recordings[0].cameras),
     }
-    write_text(out / "calibration.toml", calibration_toml(found.cameras))
-    write_json(out / "report.json", report)
-    _plot(recordings, seen, found, out / "corners.png")
+    with locked(out / ".lock", out, "a folder that no other calibration writes to", temporary=True):
+        remove_parts(out)
+        write_text(out / "calibration.toml", calibration_toml(found.cameras))
+        write_json(out / "report.json", report)
+        _plot(recordings, seen, found, out / "corners.png")
     _print(report)
     print(f"calibration, report and image: {out}")
     return 0

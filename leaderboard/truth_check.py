@@ -101,3 +101,16 @@ def _high_pass(image: Float64) -> Float64:
     from scipy.ndimage import uniform_filter
 
     return np.asarray(image - uniform_filter(image, _WINDOW))
+
+
+def once_a_scene(second_renderings: SecondRenderings) -> SecondRenderings:
+    """Return the same renderings; those of a scene are rendered once for all entries."""
+    known: dict[tuple[str, str, str], Renderings | None] = {}
+
+    def render(scene: Scene) -> Renderings | None:
+        key = scene.id, scene.revision, scene.split
+        if key not in known:
+            known[key] = second_renderings(scene)
+        return known[key]
+
+    return render

@@ -27,7 +27,7 @@ from spike4dgs.leaderboard.rank import FILES, flags_of, make_boards
 from spike4dgs.leaderboard.reading import Reading, read_all
 from spike4dgs.leaderboard.thumbnails import KEY, check_sheet, make_thumbnails, read_sheet, sheet_path, sheets
 from spike4dgs.leaderboard.tracks import match_release
-from spike4dgs.leaderboard.truth_check import Renderings, SecondRenderings, TruthCheck, check_truth, no_renderings
+from spike4dgs.leaderboard.truth_check import SecondRenderings, TruthCheck, check_truth, no_renderings, once_a_scene
 
 GAIN_TOLERANCE = 1e-6  # relative: between machines the last bits of a mean differ
 # Of an equivalent scene's scores on the release: dB, and of other metrics relative. On `tiny` scenes with 8 and with 16
@@ -168,7 +168,7 @@ def verify_leaderboard(
     scored = not_fitted = 0
     if predictions is not None:
         by_id = {open_scenes([scene], allow_gaps)[0].id: scene for scene in scenes}
-        rendered = _once_a_scene(second_renderings)
+        rendered = once_a_scene(second_renderings)
         for path, entry in entries.items():
             try:
                 if opened := _scenes_of(entry, predictions, by_id, allow_gaps):
@@ -232,19 +232,6 @@ def _revisions(scene: str, dataset: Mapping[str, Any]) -> tuple[str, ...]:
     return dataset["scenes"][scene], *([equivalent["revision"]] if equivalent else [])
 
 
-def _once_a_scene(second_renderings: SecondRenderings) -> SecondRenderings:
-    """Return the same renderings; those of a scene are rendered once for all entries."""
-    known: dict[tuple[str, str, str], Renderings | None] = {}
-
-    def render(scene: Scene) -> Renderings | None:
-        key = scene.id, scene.revision, scene.split
-        if key not in known:
-            known[key] = second_renderings(scene)
-        return known[key]
-
-    return render
-
-
 def _score_again(
     where: Path, entry: Entry, predictions: Path, scenes: Sequence[Scene], second_renderings: SecondRenderings
 ) -> None:
@@ -253,6 +240,9 @@ def _score_again(
     rescored = verify_record(record, where, predictions / record["method"]["name"], scenes, second_renderings)
     if stated["label"] == CLAIMED:
         return
+    if hidden := sorted(m for m in stated["unverified"] if METRICS[m].weights is None):
+        fix = "the entry was edited: restore it, or submit the record again with --replace"
+        raise problem(where, "no unverified metric that needs no weights", ", ".join(hidden), fix)
     before = "carried_over" in stated and not stated["truth"]  # the check is younger than the entry
     if not before and (extra := sorted(rescored.truth.keys() ^ stated["truth"].keys())):
         fix = "submit the record again with --replace"

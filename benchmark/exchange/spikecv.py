@@ -163,6 +163,9 @@ def _read_ticks(source: _Source) -> Iterator[UInt8]:
             yield np.packbits(spikes.reshape(n, pixels), axis=1, bitorder="little")
 
 
+_LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # k1, k2, p1, p2, k3, or some of them
+
+
 def _read_poses(path: Path, sources: dict[str, _Source]) -> tuple[Camera, ...]:
     """Read a camera for each stream; intrinsics are given at each frame or once at the top, as nerfstudio allows.
 
@@ -173,6 +176,11 @@ def _read_poses(path: Path, sources: dict[str, _Source]) -> tuple[Camera, ...]:
     if not isinstance(listed, list) or not all(isinstance(frame, dict) for frame in listed):
         raise problem(path, "a list `frames` of objects", "another value", "correct the file")
     frames: list[dict[str, Any]] = [{**data, **frame} for frame in listed]
+    for frame in frames:
+        model, more = str(frame.get("camera_model", "OPENCV")), [k for k in ("k4", "k5", "k6") if frame.get(k)]
+        if model not in _LENSES or more:
+            fix = "calibrate with OpenCV's first five coefficients"
+            raise problem(path, f"a camera_model of {', '.join(_LENSES)}", f"{model} {' '.join(more)}".strip(), fix)
     cameras = {str(f.get("camera")): from_nerfstudio(str(f.get("camera")), f, str(path)) for f in frames}
     missing = sorted(set(sources) - set(cameras))
     if missing:

@@ -214,7 +214,8 @@ def part_of(path: str) -> str:
 def camera_of(path: str, cameras: Collection[str]) -> str | None:
     """Return the camera that a file belongs to, by the names of its folders and its own; None for the scene's files."""
     *folders, name = path.split("/")
-    named = [word for word in (*folders, name.partition(".")[0]) if word in cameras]
+    named = [word for word in folders if word in cameras]
+    named = named or sorted((c for c in cameras if name.startswith(f"{c}.")), key=len)[-1:]  # `cam` begins `cam.1` too
     return named[0] if folders and named else None
 
 

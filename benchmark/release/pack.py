@@ -102,8 +102,9 @@ def _with_counts(scene: Scene, copy: Path) -> Scene:
     if not any(re.fullmatch(r"calibration/(flat|dark)/[^/]+\.dat", path) for path in scene.manifest.files):
         return scene
     if copy.exists():  # an earlier run made it
-        opened = open_scene(copy, allow_gaps=True)
-        if opened.revision == scene.revision:
+        opened, kept = open_scene(copy, allow_gaps=True), dict(scene.manifest.files)
+        texts = [name for name in kept if "/" not in name and name != croissant.NAME]  # a revision has no title
+        if opened.revision == scene.revision and all(opened.manifest.files.get(name) == kept[name] for name in texts):
             return opened
         shutil.rmtree(copy)
     print(f"{scene.root}: counting the recordings of its sensors")

@@ -37,6 +37,7 @@ TOKENS = {"zenodo": "ZENODO_TOKEN", "hub": "HF_TOKEN", "server": "SPIKE4DGS_UPLO
 MOST_FILES, MOST_BYTES = 100, 50_000_000_000  # of a Zenodo record
 _OPEN = ("CC0-1.0", "CC-BY-4.0", "CC-BY-SA-4.0", "Apache-2.0", "MIT")  # licences by which a release may be published
 _TRIES, _WAIT_S, _TIMEOUT_S = 5, 0.5, 120
+_MOST_BYTES = 64 << 20  # of a host's answer
 _PASSES = (408, 425, 429, 500, 502, 503, 504)  # answers that may be others the next time
 
 
@@ -253,7 +254,10 @@ class _Stay(HTTPRedirectHandler):
 
 def _answer(request: Request) -> tuple[bytes, Mapping[str, str]]:
     with build_opener(_Stay).open(request, timeout=_TIMEOUT_S) as answer:
-        return answer.read(), answer.headers
+        data: bytes = answer.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise problem(request.full_url, f"an answer of {_MOST_BYTES >> 20} MiB at most", "more", "ask the host")
+        return data, answer.headers
 
 
 def _json(text: bytes, where: str) -> Any:

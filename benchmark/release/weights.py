@@ -24,6 +24,8 @@ def fetch_weights(source: Source, name: str, file: WeightFile) -> Path:
         size = file.bytes or source.size(name)
         if size is None:
             raise problem(source.where(name), "a server that states sizes", "one that does not", "use another source")
+        if file.sha256 is None:  # nothing tells whether an earlier part is whole, or of this source
+            part.unlink(missing_ok=True)
         for attempt in (1, 2):  # the part of an earlier run may be damaged
             _append(source, name, part, size)
             if file.sha256 in (None, found := sha256_file(part)):

@@ -26,6 +26,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, remove_parts, write_text
 from spike4dgs.benchmark.method import Budget, Method, no_progress
 from spike4dgs.benchmark.metrics.measure import AUTO, Selection, select_metrics
+from spike4dgs.benchmark.metrics.ssim_window import SSIM_WINDOW
 from spike4dgs.benchmark.runs.apart.fit import Apart, fit_job
 from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, why_not_kept
 from spike4dgs.benchmark.runs.display import RunDisplay, ShownCell, cell_summary
@@ -262,6 +263,8 @@ def check_inputs(scene: Scene) -> None:
     """Hash every file that the run will read. Raises UserError at the first damaged one."""
     if not scene.targets:
         raise problem(scene.root, "a scene with targets", "none in targets.json", "use a scene that has ground truth")
+    if (side := min(min(c.width, c.height) for c in scene.cameras.values())) < SSIM_WINDOW:
+        raise problem(scene.root, f"views of {SSIM_WINDOW} pixels or more each way", f"{side}", "use larger views")
     _ = scene.training
     for t in scene.targets:
         scene.manifest.path(f"images/{t.name}.exr")

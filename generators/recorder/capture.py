@@ -161,7 +161,7 @@ class _Capture:
         if self.interrupted:
             sound = [self.cutters[c].next_tick for c, r in self.readers.items() if r.end == OK]
             n_ticks = min(n_ticks, min(sound) if sound else max(c.next_tick for c in self.cutters.values()))
-        if n_ticks <= 0:
+        if n_ticks <= 0 or not any(c.next_tick for c in self.cutters.values()):
             raise _nothing()
         cameras = [self._camera_clip(c.id, runs[c.id], n_ticks) for c in self.profile.cameras if c.id in self.links]
         return Clip(n_ticks, tuple(cameras), self.sync, self.interrupted)

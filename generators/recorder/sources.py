@@ -113,6 +113,9 @@ def _worse_source(
 
     Uniform light and darkness are recorded until nothing is lost: only a clip misses ticks.
     """
+    if worse.dropped and mode == CLIP and not all(c.start and c.stop for c in profile.cameras):
+        fix = "add them to the rig, or leave it out: ticks are lost after the rehearsal"
+        raise problem("--worse.dropped", f"start and stop sequences of the cameras of {profile.name}", "none", fix)
     cameras = draw(worse, profile, ticks, seed)
     size = profile.width, profile.height
     sent = {name: worse_stream(streams[name], *size, camera, seed, name, mode) for name, camera in cameras.items()}

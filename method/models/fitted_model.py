@@ -174,11 +174,13 @@ class FittedModel(GaussianModel):
         return factor_at(self.light.double().cpu().numpy(), t_us / self.duration_us)
 
     def splats(self, t_us: float) -> Splats:
-        """Return what is rendered at `t_us`, in the frame of the array; a lamp's layer is in the gray values."""
+        """Return what is rendered at `t_us`, in the frame of the array; that time's light is in the gray values."""
         splats = self._all(t_us)
-        if not self._layered:
+        if self.light is None:
             return splats
-        return Splats(*splats.geometry, lit(splats.colors[:, :1], splats.colors[:, None], self._light_at(t_us)))
+        factor, colors = self._light_at(t_us), splats.colors
+        gray = lit(colors[:, :1], colors[:, None], factor) if self._layered else colors * factor
+        return Splats(*splats.geometry, gray)
 
     def _all(self, t_us: float) -> Splats:
         moving = self._moving(t_us)

@@ -79,8 +79,9 @@ def residuals(found: Comparison) -> dict[str, float]:
 
 
 def mean_residual(found: Comparison) -> float:
-    """Return the mean of the cameras' residuals in dB."""
-    return float(np.mean(list(residuals(found).values())))
+    """Return the mean of the cameras' residuals in dB, of those that have measured something."""
+    known = [value for value in residuals(found).values() if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
 
 
 def write_sheet(path: Path, found: Comparison, title: str) -> None:

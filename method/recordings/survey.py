@@ -76,6 +76,11 @@ def survey_gains(scene: TrainingScene) -> tuple[TrainingScene, tuple[str, ...]]:
     gains = from_recordings(scene) if known else between_views(scene)
     if gains is None or abs(gains - 1).max() < LEAST_GAIN:
         return scene, ()
+    if gains.max() > MOST_RATIO * gains.min():
+        low, high = (scene.cameras[int(i)].id for i in (gains.argmin(), gains.argmax()))
+        expected = f"gains that differ by less than {MOST_RATIO:g} times"
+        fix = "record uniform light with the exposure of the clip"
+        raise problem(f"scene {scene.id}", expected, f"{gains.min():.3g} of {low}, {gains.max():.3g} of {high}", fix)
     states = {c.id: replace(scene.state(c.id), gain=float(g)) for c, g in zip(scene.cameras, gains, strict=True)}
     how = "from the recordings of uniform light" if known else "from points that several cameras see"
     note = f"gains of the cameras from {gains.min():.3f} to {gains.max():.3f} of their mean, estimated {how}: corrected"

@@ -117,6 +117,7 @@ class Viewer:
         w.stale, w.coarse = False, scale == 1.0
         seen, chosen, mode = w.client.camera, self.camera.value, self.mode.value
         if chosen == FREE:
+            mode = "rendered"  # the controls change one after the other, and only training cameras have spikes
             first, turn = self.content.cameras[0], need_viser().transforms.SO3(seen.wxyz).as_matrix()
             camera = free_camera(turn, seen.position, seen.fov, seen.aspect, first.width * first.height)
         else:

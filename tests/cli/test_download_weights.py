@@ -98,6 +98,8 @@ def test_cuts_and_a_damaged_part_of_an_earlier_run(server: Path, hub: Path) -> N
 
 def test_a_file_without_a_fixed_hash(server: Path, hub: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (server / "dust3r.safetensors").write_bytes(b"tensors")
+    hub.mkdir(parents=True)
+    (hub / ".dust3r.safetensors.part").write_bytes(b"other")  # of another source: no hash tells
     with serve(server) as (address, _):
         assert command("dust3r", source=address, yes=True) == 0
     assert hashlib.sha256(b"tensors").hexdigest() in capsys.readouterr().out

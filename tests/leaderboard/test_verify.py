@@ -269,6 +269,7 @@ def edit_truth(**changes: Any) -> Any:
     ("change", "message"),
     [
         (edit_truth(equal_pixels=0.0), r"scene pattern-0: expected equal_pixels 0\.\d+, as computed again, found 0\.0"),
+        (lambda e: e["verification"].update(unverified=["psnr"]), "no unverified metric that needs no weights"),
         (edit_truth(equal_images=1), "expected equal_images 0, as computed again, found 1"),
         (lambda e: e["verification"]["truth"].pop("pattern-1"), "expected a check beside the truth of each scored"),
         (

@@ -109,7 +109,7 @@ def fit_apart(
     packed, where = packed_method(job.method), f"the process of {job.method.name}"
     for variant in range(len(folders)):
         shutil.rmtree(images_folder(work, variant), ignore_errors=True)
-    with _training_part(job, work, apart) as part, _started(part, work, apart) as process:
+    with _training_part(job, work) as part, _started(part, work, apart) as process:
         child = _Child(process, where, progress, note)
         order = Order(
             method=packed,
@@ -193,19 +193,15 @@ class _Child:
 
 
 @contextmanager
-def _training_part(job: Job, work: Path, apart: Apart) -> Iterator[Path]:
-    """Write the training part and remove it at the end. It is on the scene's disk, where its files are links.
+def _training_part(job: Job, work: Path) -> Iterator[Path]:
+    """Write the training part and remove it at the end. On the scene's disk its files are links, on others copies.
 
-    A container hides the scenes' folder, and so has it among the work, of whatever disk. Each has a folder of its own:
-    the process of a fit whose caller was killed may still be removing another.
+    Each has a folder of its own among the work, where nothing of the scene is near: the process of a fit whose caller
+    was killed may still be removing another.
     """
-    root, own = job.scene.root.absolute(), uuid4().hex[:16]
-    for left in work.glob("part-*"):
+    for left in work.glob("*part-*"):
         shutil.rmtree(left, ignore_errors=True)
-    folder = work / f"part-{own}"
-    other_disk = root.stat().st_dev != work.stat().st_dev
-    if other_disk and not apart.container and os.access(root.parent, os.W_OK):
-        folder = root.parent / f".spike4dgs-fit-{own}"
+    folder = work / f"part-{uuid4().hex[:16]}"
     given = getattr(job.method, "given", DEFAULT_GIVEN)
     try:
         yield write_nameless_part(job.scene, folder, given).root

@@ -17,7 +17,8 @@ from typing import IO, Any
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.json_values.text import parse_json
-from spike4dgs.benchmark.method import Budget, Method, find_methods, get_method
+from spike4dgs.benchmark.method import GROUP, Budget, Method, find_methods, get_method
+from spike4dgs.benchmark.plugins import is_distributed
 from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.runs.refinement import View
@@ -66,10 +67,13 @@ def identity(method: Method) -> dict[str, Any]:
 
 
 def packed_method(method: Method) -> bytes | str:
-    """Return a method as it travels: pickled, or by its name where it is installed.
+    """Return a method as it travels: by its name where it is of an installed package, or else pickled.
 
-    Raises an exception where it can neither be pickled nor found.
+    To pickle it would run its code here, beside the truth. Raises an exception where it can neither be found nor
+    pickled.
     """
+    if is_distributed(GROUP, method.name.partition("[")[0]) and identity(get_method(method.name)) == identity(method):
+        return method.name
     try:
         return pickle.dumps(method)
     except Exception:  # what pickle raises depends on the object

@@ -57,13 +57,17 @@ def calibrate_array(
     found = adjust(rough.rig, used, points, reference, freedom)
     error = rms_px(found.rig, used, points)
     left_out = float(np.mean(~used.used))
-    if not (error < WORST_PX and left_out < MOST_LEFT_OUT):
+    each = tuple(rms_px(found.rig, used.of(used.camera == c), points) for c in range(len(names)))
+    lost = [float(np.mean(~used.used[used.camera == c])) for c in range(len(names))]
+    facts = zip(names, each, lost, strict=True)
+    wrong = [name for name, own, share in facts if not (own < WORST_PX and share < MOST_LEFT_OUT)]
+    if wrong or not (error < WORST_PX and left_out < MOST_LEFT_OUT):
         expected = (
             f"a reprojection error below {WORST_PX:g} px, and at least {1 - MOST_LEFT_OUT:.0%} of the corners in it"
         )
         fix = "check that all cameras share one clock and one orientation (`rows`, `mirrored`), and --columns, --rows"
-        raise problem("array", expected, f"{error:.2f} px with {1 - left_out:.0%} of them", fix)
-    each = tuple(rms_px(found.rig, used.of(used.camera == c), points) for c in range(len(names)))
+        named = f"; other cameras than {', '.join(wrong)} agree" if 0 < len(wrong) < len(names) else ""
+        raise problem("array", expected, f"{error:.2f} px with {1 - left_out:.0%} of them{named}", fix)
     return ArrayCalibration(levelled(found.rig, names, size), found, used, reference, error, each)
 
 

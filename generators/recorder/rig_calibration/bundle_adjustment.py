@@ -112,7 +112,8 @@ def adjust(
     damping = 1e-3
     cost, H, g = _normal(rig, detections, points, columns)
     for _ in range(_MOST_STEPS):
-        step = np.asarray(np.linalg.solve(H + damping * np.diag(np.diag(H)), -g), np.float64)
+        own = np.diag(H)  # 0 of a view or a camera whose corners are all left out: it stays where it is
+        step = np.asarray(np.linalg.solve(H + damping * np.diag(np.where(own > 0, own, 1.0)), -g), np.float64)
         moved = _moved(rig, step, columns)
         new, new_H, new_g = _normal(moved, detections, points, columns)
         if not new < cost:
@@ -137,8 +138,10 @@ def trimmed(rig: Rig, detections: Detections, points: Float64, sigmas: float = 4
 
 
 def rms_px(rig: Rig, detections: Detections, points: Float64) -> float:
-    """Return the reprojection error: root mean square distance of the used corners."""
+    """Return the reprojection error: root mean square distance of the used corners; NaN without any."""
     errors = rig.residuals(detections, points)[detections.used]
+    if not len(errors):
+        return math.nan
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1))))
 
 

@@ -168,6 +168,9 @@ def test_poses_must_fit_the_streams(tmp_path: Path) -> None:
         attempt({"camera": "cam_00", **pose})
     with pytest.raises(UserError, match="expected 11x5 pixels for cam_00, found 12x5"):
         attempt({"camera": "cam_00", **pose, "w": 12}, {"camera": "cam_01", **pose})
+    for lens in ({"camera_model": "OPENCV_FISHEYE", "k1": 0.05}, {"k4": 0.001}):
+        with pytest.raises(UserError, match="expected a camera_model of OPENCV, PINHOLE"):
+            attempt({"camera": "cam_00", **pose, **lens}, {"camera": "cam_01", **pose})
     with pytest.raises(UserError, match="one size and length for one scene, found 11x5x8 and 11x5x9"):
         attempt({"camera": "cam_00", **pose}, {"camera": "cam_01", **pose})
     assert not (tmp_path / "out").exists()

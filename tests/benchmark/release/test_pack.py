@@ -19,7 +19,7 @@ from changes import files_in, flip_bit
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked, read_json
 from spike4dgs.benchmark.release import shard as shard_module
-from spike4dgs.benchmark.release.index import BLOCK, Release, read_release
+from spike4dgs.benchmark.release.index import BLOCK, Release, camera_of, read_release
 from spike4dgs.benchmark.release.pack import SUMS, counted_copy, pack
 from spike4dgs.benchmark.scene.scene import open_scene, open_scenes
 from spike4dgs.benchmark.scene.verify import verify_content
@@ -196,6 +196,19 @@ def test_an_emulated_array_needs_the_raw_recordings(one_full_scene: Path, tmp_pa
     copy = counted_copy(open_scene(one_full_scene), tmp_path / "copy")
     with pytest.raises(UserError, match=r"cam_00.npz: expected a raw recording \(.dat\), found a counted one"):
         emulated_source(copy.root, None, DARK)
+
+
+def test_files_belong_to_the_camera_whose_whole_name_they_bear() -> None:
+    cameras = ("cam", "cam.0", "cam_00.raw")
+    for path, camera in (
+        ("spikes/cam.dat", "cam"),
+        ("spikes/cam.0.dat", "cam.0"),
+        ("spikes/cam_00.raw.dat", "cam_00.raw"),
+        ("images/cam.0/000020.exr", "cam.0"),
+        ("scene.json", None),
+        ("sparse/0/cameras.bin", None),
+    ):
+        assert camera_of(path, cameras) == camera
 
 
 def test_the_working_folder_is_a_folder_too(

@@ -96,6 +96,8 @@ def test_a_model_keeps_the_light_that_it_was_fitted_in(tmp_path: Path) -> None:
         image = loaded.render(WORLD.held_out, share * DURATION_US)
         np.testing.assert_array_equal(image, lit.render(WORLD.held_out, share * DURATION_US))
         np.testing.assert_allclose(image, factor * steady.render(WORLD.held_out, share * DURATION_US), rtol=1e-5)
+        colors = [m.splats(share * DURATION_US).colors for m in (loaded, steady)]
+        torch.testing.assert_close(colors[0], factor * colors[1]), "as files of splats have it"
 
 
 def test_a_model_keeps_the_layer_of_a_lamp(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.images.table import IMAGES
@@ -8,7 +9,7 @@ from spike4dgs.baselines.images.tfp import TfpSettings
 from spike4dgs.baselines.recipes import METHODS
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.method.recordings.comparison import compare, residual_db
+from spike4dgs.method.recordings.comparison import Comparison, compare, mean_residual, residual_db
 
 
 class Black:
@@ -30,3 +31,11 @@ def test_the_residual_of_equal_images_is_finite() -> None:
     image = np.array([0.25, 0.5, np.nan])
     assert residual_db(image, image) == MAX_PSNR_DB == 100.0
     assert residual_db(image, image + 1e-9) == MAX_PSNR_DB, "and no render has more"
+
+
+def test_a_camera_that_measured_nothing_is_not_in_the_mean() -> None:
+    cameras = ToyWorld(width=8, height=6, side=2, n_ticks=10).training.cameras[:2]
+    images = np.full((1, 2, 6, 8), 0.5, np.float32)
+    images[:, 1] = np.nan
+    found = Comparison(cameras, (0.0,), images, np.full_like(images, 0.6), "tfp")
+    assert mean_residual(found) == pytest.approx(20)

@@ -51,6 +51,12 @@ def test_a_perfect_recording_is_left_as_it_is():
     assert found.scene.states == {} and set(found.bad) == set(NAMES)
 
 
+def test_gains_of_uniform_light_that_differ_by_orders_of_magnitude_are_refused():
+    light = [recordings(gain=0.02), *[recordings()] * (len(NAMES) - 1)]
+    with pytest.raises(UserError, match=f"gains that differ by less than 30 times, found .* of {NAMES[0]}"):
+        survey_gains(replace(SCENE, recordings=tuple(light)))
+
+
 def test_single_missing_ticks_cost_next_to_nothing():
     gaps = [(t, 1) for t in (3, 50, 51, 120, 199)]
     scene = changed(1, lambda s: s, gaps)

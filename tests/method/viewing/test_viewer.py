@@ -58,6 +58,19 @@ def test_the_three_images() -> None:
     assert error_colors()[0].sum() < 10 and error_colors()[-1].sum() > 600, "from black to nearly white"
 
 
+@pytest.mark.parametrize(
+    "options", [("--port", "0"), ("--port", "65536"), ("--host", "203.0.113.7"), ("--host", "no such host")]
+)
+def test_view_ends_at_a_bad_host_or_port(
+    tmp_path: Path, options: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("viser", reason="viser is not installed (extra: viewer)")
+    model("static").save(path := tmp_path / "m.safetensors", provenance())
+    assert main(["view", str(path), *options]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {options[0]}: expected") and error.count("\n") == 1
+
+
 def test_ticks_in_which_no_light_is_gathered_are_counted_out() -> None:
     """A pixel that gathers nothing for half a tick after each spike has seen x = r / (1 - r / 2)."""
     camera, t_us, scene = TRAINED[1], 0.5 * DURATION_US, WORLD.training

@@ -160,6 +160,30 @@ def test_cameras_with_too_few_or_no_common_views_are_named():
         initial(cameras, apart)
 
 
+@pytest.mark.parametrize("offset_px", [6.0, 12.0, 25.0])
+def test_a_view_whose_corners_all_go_is_left_out(offset_px):
+    """Two cameras see it, and one finds the board elsewhere: no pose explains both."""
+    cameras = CAMERAS[:6]
+    detections = detections_of(cameras, np.linspace(0, 1, 13), 0.05)
+    two = (detections.view != 5) | (detections.camera < 2)
+    detections = detections.of(two)
+    uv = detections.uv.copy()
+    uv[(detections.view == 5) & (detections.camera == 1)] += [offset_px, 0.0]
+    names, shown = [c.id for c in cameras], replace(detections, uv=uv)
+    found = array_calibration.calibrate_array(shown, BOARD, names, (WIDTH, HEIGHT), Freedom())
+    assert found.reprojection_px < 0.1 and not found.detections.used[found.detections.view == 5].all()
+
+
+def test_a_camera_whose_corners_are_left_out_is_named():
+    """One of nine is late: the others hide it in the mean of all."""
+    cameras, shares = CAMERAS[:9], np.linspace(0, 1, 13)
+    detections, late = detections_of(cameras, shares, 0.05), detections_of(cameras, np.clip(shares - 0.012, 0, 1), 0.05)
+    slow = (detections.camera == 4)[:, None, None]
+    mixed = replace(detections, uv=np.where(slow, late.uv, detections.uv))
+    with pytest.raises(UserError, match=f"other cameras than {cameras[4].id} agree"):
+        array_calibration.calibrate_array(mixed, BOARD, [c.id for c in cameras], (WIDTH, HEIGHT), Freedom())
+
+
 def test_an_array_that_no_pinholes_explain_is_refused():
     cameras, shares = CAMERAS[:3], np.linspace(0, 1, 12)
     detections = detections_of(cameras, shares, 0.0)
