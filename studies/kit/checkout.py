@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from spike4dgs import baselines, benchmark, generators, method, studies
+from spike4dgs import baselines, benchmark, generators, method
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.runs.method_code import sources_sha256
 
@@ -14,7 +15,7 @@ from spike4dgs.benchmark.runs.method_code import sources_sha256
 @cache
 def code_now() -> str:
     """Return a digest of all that a study runs: a commit tells of no edits, and an installation has none."""
-    return sources_sha256([baselines, benchmark, generators, method, studies])
+    return sources_sha256([baselines, benchmark, generators, method, sys.modules[__name__.rpartition(".kit.")[0]]])
 
 
 def find_checkout(command: str) -> Path:

@@ -83,14 +83,9 @@ def tuning(
     chosen = choose_device_for(recipes, device)
     for recipe in recipes:
         method = keeping(recipe, chosen)
-        about = {
-            "row": method.name,
-            "scenes": {scene.id: scene.revision for scene in opened},
-            "budget": make_budget(budget).label,
-            "seed": seed,
-            "device": device_type(chosen),
-            "code": sources_sha256([benchmark, method_room, baselines]),
-        }
+        of = {scene.id: scene.revision for scene in opened}
+        about = {"row": method.name, "scenes": of, "budget": make_budget(budget).label, "seed": seed}
+        about |= {"device": device_type(chosen), "code": sources_sha256([benchmark, method_room, baselines])}
         search(method, opened, out / f"{method.name}.json", about, trials, _fit_by(seed, chosen, budget), print)
         write_results(out)
     print(f"table: {out / 'tuning.md'}")

@@ -55,6 +55,8 @@ def calibrate_array(
     rough = adjust(initial, detections, points, reference, freedom)
     used = trimmed(rough.rig, detections, points)
     found = adjust(rough.rig, used, points, reference, freedom)
+    used = trimmed(found.rig, detections, points)  # what fits now, and did not beside those that are left out
+    found = adjust(found.rig, used, points, reference, freedom)
     error = rms_px(found.rig, used, points)
     left_out = float(np.mean(~used.used))
     each = tuple(rms_px(found.rig, used.of(used.camera == c), points) for c in range(len(names)))
