@@ -176,8 +176,8 @@ class FittedModel(GaussianModel):
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`, in the frame of the array; that time's light is in the gray values."""
         splats = self._all(t_us)
-        if self.light is None:
-            return splats
+        if self.light is None or not (self._layered or splats.colors.shape[1] == 1):
+            return splats  # what a network decodes is no gray value: its image is lit
         factor, colors = self._light_at(t_us), splats.colors
         gray = lit(colors[:, :1], colors[:, None], factor) if self._layered else colors * factor
         return Splats(*splats.geometry, gray)

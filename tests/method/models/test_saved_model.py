@@ -86,6 +86,14 @@ def test_a_model_keeps_the_filter_that_it_was_fitted_with(tmp_path: Path) -> Non
     assert abs(images[1] - images[2]).max() > 0.01, "the filter matters"
 
 
+def test_light_is_not_in_what_a_network_decodes() -> None:
+    steady = model("spacetime")
+    lit = dataclasses.replace(steady, light=torch.tensor([0.5, 1.5]))
+    assert torch.equal(lit.splats(0.0).colors, steady.splats(0.0).colors) and steady.splats(0.0).colors.shape[1] > 1
+    image = lit.render(WORLD.held_out, 0.0)
+    np.testing.assert_allclose(image, 0.5 * steady.render(WORLD.held_out, 0.0), rtol=1e-5)
+
+
 def test_a_model_keeps_the_light_that_it_was_fitted_in(tmp_path: Path) -> None:
     steady, factors = model("paths"), torch.tensor([0.5, 1.0, 1.5, 1.0])
     lit = dataclasses.replace(steady, light=factors)
