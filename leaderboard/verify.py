@@ -37,6 +37,7 @@ CEILING_DB = 0.1  # of a noise ceiling that was rendered on another processor
 # Fits on two CPUs differ by their last bits, which a fit amplifies: by 0.24 dB in a scene's mean PSNR at most, between
 # two CPUs and six methods on car and turntable.
 TOLERANCE_DB = 0.3
+_EDITED = "the entry was edited: restore it, or submit the record again with --replace"
 FitAgain = Callable[[Record, Sequence[Scene]], object]  # raises UserError where the scores are not reached
 
 
@@ -241,8 +242,7 @@ def _score_again(
     if stated["label"] == CLAIMED:
         return
     if hidden := sorted(m for m in stated["unverified"] if METRICS[m].weights is None):
-        fix = "the entry was edited: restore it, or submit the record again with --replace"
-        raise problem(where, "no unverified metric that needs no weights", ", ".join(hidden), fix)
+        raise problem(where, "no unverified metric that needs no weights", ", ".join(hidden), _EDITED)
     before = "carried_over" in stated and not stated["truth"]  # the check is younger than the entry
     if not before and (extra := sorted(rescored.truth.keys() ^ stated["truth"].keys())):
         fix = "submit the record again with --replace"
@@ -264,14 +264,13 @@ def _check_truth(where: str, stated: Mapping[str, Any], found: TruthCheck) -> No
 
     What takes second renderings is compared where there were and are some; another processor renders other last bits.
     """
-    fix = "the entry was edited: restore it, or submit the record again with --replace"
     allowed = {"noise_share": found.noise_share_error, "noise_share_error": found.noise_share_error}
     allowed["ceiling_db"] = CEILING_DB
     for key, value in asdict(found).items():
         if key in allowed and (value is None or stated[key] is None):
             continue
         if abs(value - stated[key]) > (allowed.get(key) or 0.0):
-            raise problem(where, f"{key} {value}, as computed again", str(stated[key]), fix)
+            raise problem(where, f"{key} {value}, as computed again", str(stated[key]), _EDITED)
 
 
 def _fit_again(where: Path, entry: Entry, scenes: Sequence[Scene], fit_again: FitAgain | None) -> None:

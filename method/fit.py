@@ -136,6 +136,10 @@ class RecipeMethod(Shown):
     def _about(self) -> str:
         return f"{self.name}: {self.description}"
 
+    def maker(self, settings: Mapping[str, Any]) -> ImageMaker:
+        """Return the image maker of the recipe's settings."""
+        return self.images.with_settings(settings.get("image_maker", self.images.settings))
+
     def with_settings(self, overrides: Mapping[str, Any], name: str) -> RecipeMethod:
         """Return the same recipe with other settings, by names PART.NAME, under another name.
 
@@ -197,7 +201,7 @@ class RecipeMethod(Shown):
                 print(f"{scene.id}: one image of each camera shows no motion: a static model", file=sys.stderr)
                 algorithm, settings = self._static(settings)
         else:
-            maker = self.images.with_settings(settings.get("image_maker", self.images.settings))
+            maker = self.maker(settings)
             light = light_of(scene, algorithm.layers) if maker.knows_light else None
 
             def make(maker: ImageMaker, settings: ImageSettings) -> TrainingImages:

@@ -212,6 +212,12 @@ class PredictionWriter:
             shutil.rmtree(self._part, ignore_errors=True)
 
 
+def check_place(root: Path) -> None:
+    """Raise UserError where something else than earlier predictions is, which a PredictionWriter would replace."""
+    if root.exists() and not (root / INFO).is_file():
+        raise problem(root, "a new folder, or earlier predictions", "something else", "choose another folder")
+
+
 def write_predictions(
     root: Path | str,
     scene: Scene | Path | str,
@@ -233,8 +239,7 @@ def write_predictions(
         write_predictions("runs/mine", scene, images, "my-method")
     """
     root, opened = Path(root).absolute(), scene if isinstance(scene, Scene) else open_scene(scene)
-    if root.exists() and not (root / INFO).is_file():
-        raise problem(root, "a new folder, or earlier predictions", "something else", "choose another folder")
+    check_place(root)
     fix = "give an image for each of scene.targets"
     _same_names(root, {t.name for t in images}, {t.name for t in opened.targets}, "the scene's targets", fix)
     with PredictionWriter(root) as writer:

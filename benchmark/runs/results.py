@@ -69,6 +69,11 @@ def _image_rows(record: Record) -> Iterator[dict[str, Any]]:
             yield {**_names(record, scene), "camera": camera, "tick": int(tick), **values}
 
 
+def record_paths(run: Path) -> list[Path]:
+    """Return the records of a run, of all seeds."""
+    return [*visible(run, "results/*.json"), *visible(run, "seed-*/results/*.json")]
+
+
 def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     """Return the records of other methods in a run's `folder` on the same scenes, revisions and split, oldest first.
 
@@ -77,7 +82,7 @@ def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Recor
     """
     names, dataset = {r["method"]["name"] for r in records}, records[0]["dataset"]
     found, left_out = [], []
-    for path in [*visible(folder, "results/*.json"), *visible(folder, "seed-*/results/*.json")]:
+    for path in record_paths(folder):
         if path.stem in names:
             continue
         try:

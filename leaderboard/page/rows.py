@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import visible
 from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
+from spike4dgs.benchmark.runs.results import record_paths
 from spike4dgs.leaderboard.entry import Entry
 from spike4dgs.leaderboard.rank import make_boards, reason
 from spike4dgs.leaderboard.reading import Reading, read_briefs, read_checked
@@ -126,8 +126,7 @@ def _by_dataset(records: Sequence[Record]) -> list[list[Record]]:
 
 def run_records(run: Path) -> list[Record]:
     """Return the records of a finished run, of all seeds. Raises UserError where there is none."""
-    paths = [*visible(run, "results/*.json"), *visible(run, "seed-*/results/*.json")]
-    if not paths:
+    if not (paths := record_paths(run)):
         raise problem(run, "a folder of run-benchmark with results/*.json", "none", "check the path of --runs")
     return [read_record(path) for path in paths]
 

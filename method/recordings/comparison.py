@@ -49,7 +49,7 @@ def compare(
     """
     recipe = method if isinstance(method, RecipeMethod) and not method.images.given else None
     maker = recipe.recipe.images if recipe else other.name
-    make = recipe.images.with_settings(recipe.settings.get("image_maker", recipe.images.settings)) if recipe else other
+    make = recipe.maker(recipe.settings) if recipe else other
     settings: ImageSettings = recipe.settings["images"] if recipe else ImageSettings()  # type: ignore[assignment]
     ticks, images = make_images(scene, make, replace(settings, max_times=TIMES), device)
     times = tuple(tick * 1e6 / scene.rate_hz for tick in ticks)

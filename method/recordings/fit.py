@@ -28,7 +28,7 @@ from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.video import video_writer
 from spike4dgs.benchmark.runs.cell import timed_fit
 from spike4dgs.benchmark.runs.display import RunDisplay
-from spike4dgs.benchmark.runs.predictions import INFO, MethodInfo
+from spike4dgs.benchmark.runs.predictions import MethodInfo, check_place
 from spike4dgs.benchmark.runs.provenance import Provenance, Savable
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.images.base import ImageMaker
@@ -64,7 +64,7 @@ def fit_recording(
     """
     console, times, seed = make_console(), dict[str, float](), request.seed
     with locked(out / ".lock", out, "a folder that no other fit uses"):
-        _check_folder(out)
+        check_place(out / PREDICTIONS)  # a benchmark's are of all methods and scenes
         remove_parts(out)
         with _timed(times, "opening"):
             recording = open_recording(scene, seed)
@@ -108,15 +108,6 @@ def fit_recording(
     if judged:
         _say(console, f"held-out {', '.join(recording.held_out)} by their own spikes: {_scores(judged)}")
     _say(console, f"model, sheet, video and report: {out}/{{{MODEL},{SHEET},{VIDEO},{REPORT}}}")
-
-
-def _check_folder(out: Path) -> None:
-    """Raise UserError for a folder of `run-benchmark`, whose predictions and checkpoints a fit's would replace."""
-    if (out / PREDICTIONS).exists() and not (out / PREDICTIONS / INFO).is_file():
-        fix = "choose another --out"
-        raise problem(
-            out / PREDICTIONS, "a new folder, or predictions of an earlier fit", "those of run-benchmark", fix
-        )
 
 
 def _scores(judged: HeldOutScores) -> str:

@@ -22,14 +22,11 @@ from typing import Any
 from rich.console import Console
 from tyro.conf import Positional
 
-from spike4dgs import baselines, benchmark
-from spike4dgs import method as method_room
 from spike4dgs.baselines import recipes as theirs
 from spike4dgs.benchmark.environment import command_line, cpu_name, device_type, harness, utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, choose_device_for, get_method, make_budget
-from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
@@ -37,7 +34,7 @@ from spike4dgs.method import recipes as ours
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.tuned import read_tuned
 from spike4dgs.studies.kit.blocks import table_rows, with_block
-from spike4dgs.studies.kit.checkout import find_checkout
+from spike4dgs.studies.kit.checkout import code_now, find_checkout
 from spike4dgs.studies.kit.timing import markdown, write_csv
 from spike4dgs.studies.tuning.kept import keeping
 from spike4dgs.studies.tuning.knobs import Values, as_settings, knobs_of, start_of
@@ -85,7 +82,7 @@ def tuning(
         method = keeping(recipe, chosen)
         of = {scene.id: scene.revision for scene in opened}
         about = {"row": method.name, "scenes": of, "budget": make_budget(budget).label, "seed": seed}
-        about |= {"device": device_type(chosen), "code": sources_sha256([benchmark, method_room, baselines])}
+        about |= {"device": device_type(chosen), "code": code_now()}
         search(method, opened, out / f"{method.name}.json", about, trials, _fit_by(seed, chosen, budget), print)
         write_results(out)
     print(f"table: {out / 'tuning.md'}")
