@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, update_wrapper
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
@@ -82,9 +84,10 @@ def parts_digest(function: Callable[..., Any]) -> str:
     """Return a digest of a function, of the functions that it calls, and of the constants that they name.
 
     Constants are numbers, texts, tuples and arrays in the functions' modules, in other modules of this package that
-    they name, and in closures.
+    they name, and in closures. Of an intrinsic, which writes code by classes and nested functions, the whole source of
+    its module counts, and of those that this one takes functions and classes from.
     """
-    digest, seen = hashlib.sha256(), set[FunctionType]()
+    digest, seen, modules = hashlib.sha256(), set[FunctionType](), set[str]()
 
     def add(value: Any) -> None:
         if isinstance(value, _Deferred):
@@ -96,6 +99,9 @@ def parts_digest(function: Callable[..., Any]) -> str:
                 digest.update(repr(_instructions(value.__code__)).encode())
                 for part in _parts(value):
                     add(part)
+        elif isinstance(intrinsic := getattr(value, "_defn", None), FunctionType):
+            for source in _sources(sys.modules[intrinsic.__module__], modules):
+                digest.update(source)
         elif isinstance(value, bool | int | float | str | bytes | tuple):
             digest.update(repr(value).encode())
         elif hasattr(value, "tobytes"):
@@ -118,6 +124,19 @@ def _parts(function: FunctionType) -> list[Any]:
     found = [known[n] for n in code.co_names if n in known]
     found += [vars(m)[n] for m in modules for n in code.co_names if n in vars(m)]
     return found + [cell.cell_contents for cell in function.__closure__ or ()]
+
+
+def _sources(module: ModuleType, seen: set[str]) -> Iterator[bytes]:
+    """Yield the source of a module, and of those of its package that it has functions and classes of."""
+    if module.__name__ in seen or not module.__file__:
+        return
+    seen.add(module.__name__)
+    yield Path(module.__file__).read_bytes()
+    package = module.__name__.partition(".")[0]
+    names = (getattr(v, "__name__" if isinstance(v, ModuleType) else "__module__", None) for v in vars(module).values())
+    for name in dict.fromkeys(n for n in names if isinstance(n, str) and n.partition(".")[0] == package):
+        if name in sys.modules:
+            yield from _sources(sys.modules[name], seen)
 
 
 def _folder() -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat.types import EPS2D, PixelFilter
 from spike4dgs.method.torch_state import seeded
@@ -55,6 +56,11 @@ class TrainerSettings(Settings):
     average: float = 0.0  # share of a stage's steps, its last ones, whose parameters are averaged
     beta1: float = 0.9
     beta2: float = 0.99  # 1000 steps in all: 0.999 would average over the whole fit
+
+    def __post_init__(self) -> None:
+        if not 0 < self.initial_opacity < 1:
+            fix = "correct the number"
+            raise problem("settings of trainer", "initial_opacity between 0 and 1", str(self.initial_opacity), fix)
 
     @property
     def pixel_filter(self) -> PixelFilter:

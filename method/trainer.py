@@ -66,7 +66,7 @@ class Trainer:
         if settings.refine_poses and (settings.freeze_background or images.spans is not None):
             expected = "either trainer.refine_poses, or trainer.freeze_background and images of known spans"
             raise problem("settings", expected, "both", "choose one: the latter are rendered from the given poses")
-        if settings.average > 1 - density.refine_stop:
+        if settings.average > 1 - density.refine_stop + 1e-9:  # 1 - 0.8 is less than 0.2
             stop = density.refine_stop
             expected = f"trainer.average of at most {1 - stop:g}, as density.refine_stop is {stop:g}"
             raise problem("settings", expected, f"{settings.average:g}", "average fewer steps")

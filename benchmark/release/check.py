@@ -14,16 +14,16 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import yaml
-
 from spike4dgs.benchmark import croissant
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.release import card, index
 from spike4dgs.benchmark.release.index import Release, parse_shard, read_release
 from spike4dgs.benchmark.release.pack import SUMS
 from spike4dgs.benchmark.release.source import ByteProgress
 from spike4dgs.benchmark.scene import manifest
+from spike4dgs.benchmark.untrusted import parse_yaml
 
 MOST_FILES = 100_000  # of a repository
 MOST_ENTRIES = 10_000  # of a folder
@@ -71,10 +71,10 @@ def _limits(root: Path, files: list[Path]) -> Iterator[str]:
 def _card(root: Path) -> Iterator[str]:
     """The dataset card begins with YAML between two lines of dashes, and has a licence."""
     path = root / card.README
-    parts = path.read_text(encoding="utf-8").split("---\n", 2) if path.is_file() else []
     try:
-        facts = yaml.safe_load(parts[1]) if len(parts) == 3 and not parts[0] else None
-    except yaml.YAMLError as e:
+        parts = path.read_text(encoding="utf-8").split("---\n", 2) if path.is_file() else []
+        facts = parse_yaml(parts[1]) if len(parts) == 3 and not parts[0] else None
+    except ValueError as e:
         yield f"{path}: damaged YAML ({' '.join(str(e).split())[:100]})"
         return
     if not isinstance(facts, dict) or not facts.get("license"):
@@ -87,7 +87,7 @@ def _croissant(root: Path) -> Iterator[str]:
     if not path.is_file():
         return
     try:
-        json.loads(path.read_text(encoding="utf-8"))
+        parse_json(path.read_text(encoding="utf-8"))
     except ValueError as e:
         yield f"{path}: damaged text ({e})"
         return
@@ -104,7 +104,7 @@ def _croissant(root: Path) -> Iterator[str]:
 
 def _read_sums(root: Path) -> dict[str, str]:
     path = root / SUMS
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
     return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
 

@@ -33,6 +33,7 @@ from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 NAME = "release.json"
+SHARD = "spike4dgs-"  # begins the name of a shard and of its list
 SCHEMA, SHARD_SCHEMA = "spike4dgs-packed-release/1", "spike4dgs-shard/1"
 BLOCK = 1 << 20  # bytes that have a hash of their own: the smallest piece of a file that can be checked
 _FIX = "fetch the release again, or pack it again"

@@ -79,7 +79,7 @@ def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int, flat: 
         samples = [sample for scene in scenes for sample in _samples(scene)]
         shards = list(_in_shards(samples, shard_bytes))
         folders = ["" if flat else f"shards/{i // _SHARDS_PER_FOLDER:03d}/" for i in range(len(shards))]
-        names = [f"{folder}spike4dgs-{name}-{i:05d}.tar" for i, folder in enumerate(folders)]
+        names = [f"{folder}{index.SHARD}{name}-{i:05d}.tar" for i, folder in enumerate(folders)]
         _refuse_others(out, [*names, *map(index_of, names)])
         total = sum(file.bytes for sample in samples for file in sample.files)
         written = []

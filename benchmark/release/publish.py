@@ -146,7 +146,8 @@ def token_of(upload: Upload) -> str:
 def send(root: Path, upload: Upload, token: str) -> str:
     """Send a release and return where it lies. Raises UserError where the host refuses, or keeps failing.
 
-    Run again after a failure, files that Zenodo or Hugging Face have are not sent again.
+    Run again after a failure, files that Zenodo or Hugging Face have are not sent again. What they have of another try
+    and is not in the release goes: all other files of the Zenodo draft, and shards of a repository.
     """
     if upload.kind == "hub":
         return _to_hub(root, upload, token)
@@ -179,6 +180,8 @@ def _to_zenodo(root: Path, upload: Upload, token: str, progress: ByteProgress) -
         raise problem(api, f"a bucket at {upload.address}", bucket, "look at Zenodo's status page")
     draft = _json(_ask("PUT", address, token, body=body)[0], address)
     there = {str(f.get("filename")): str(f.get("checksum")).removeprefix("md5:") for f in draft.get("files", [])}
+    for stale in (f for f in draft.get("files", []) if f.get("filename") not in {file.name for file in upload.files}):
+        _ask("DELETE", f"{address}/files/{quote(str(stale.get('id')), safe='')}", token)
     for file in upload.files:
         md5 = _md5(root / file.name)
         if there.get(file.name) == md5:
@@ -208,6 +211,7 @@ def _to_hub(root: Path, upload: Upload, token: str) -> str:
             repo_type="dataset",
             folder_path=root,
             allow_patterns=names,
+            delete_patterns=[f"*/{index.SHARD}*", f"{index.SHARD}*"],  # of an earlier upload; what is sent stays
             commit_message=f"Spike4DGS release, {len(names)} files",
         )
     except (HfHubHTTPError, OSError, ValueError) as e:

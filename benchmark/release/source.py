@@ -131,11 +131,16 @@ class Source:
         return data
 
     def read_all(self, name: str) -> bytes:
-        """Return a small file. Raises UserError where it cannot be read."""
+        """Return a small file. Raises UserError where it cannot be read, or has more than MOST_BODY bytes."""
+        # Answers over http are bounded already, and not all servers send a part of a file.
+        end = None if self.address.startswith(_HTTP) else MOST_BODY + 1
 
         def read() -> bytes:
             self._count()
-            return bytes(self._fs.cat_file(f"{self._root}/{name}"))
+            data = bytes(self._fs.cat_file(f"{self._root}/{name}", end=end))
+            if len(data) > MOST_BODY:
+                raise TooMuch(f"an answer of more than {MOST_BODY >> 20} MiB")
+            return data
 
         return self.persist(read, name)
 
@@ -189,7 +194,7 @@ def find_source(address: str | None, what: str) -> Source:
 
 
 def _options(address: str) -> dict[str, Any]:
-    if not address.startswith(("http://", "https://")):
+    if not address.startswith(_HTTP):
         return {}
     from aiohttp import ClientTimeout
 
@@ -203,6 +208,7 @@ def _options(address: str) -> dict[str, Any]:
     return {"headers": {"Accept-Encoding": "identity"}, "client_kwargs": client}
 
 
+_HTTP = ("http://", "https://")
 MOST_BODY = 64 << 20  # bytes of an answer: a piece of a release has 16 MiB, an index some MB
 _BLOCK = 1 << 16
 

@@ -31,6 +31,9 @@ class DensitySettings(Settings):
         if self.refine_every < 1:
             fix = "refine_stop=0 never changes the density"
             raise problem("settings of density", "refine_every of 1 step or more", str(self.refine_every), fix)
+        if not self.grow_scale3d > 0:
+            fix = "a small number splits all"
+            raise problem("settings of density", "grow_scale3d above 0", str(self.grow_scale3d), fix)
 
     def due(self, done: int, steps: int) -> bool:
         """Return whether the density changes after `done` of a stage's `steps`."""
@@ -83,9 +86,10 @@ def adapt_density(
     limit: int,
     rng: torch.Generator,
 ) -> list[Edit]:
-    """Return edits to apply one after the other: move the dead, then densify where the gradient is high.
+    """Return the edits to apply: Gaussians are added where the gradient is high, as far as `limit` has room.
 
-    Faint Gaussians are relocated instead of deleted while the number is at its `limit`, and deleted before.
+    Faint ones are deleted first. Where as many as `limit` or more are left without them, as of too many first points,
+    they are moved to others instead, and none is added.
     """
     dead = gaussians.logits.detach().sigmoid() < settings.prune_opacity
     grow = statistics.mean() * ~dead

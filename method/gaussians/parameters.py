@@ -103,9 +103,13 @@ def from_points(
 
     Raises UserError for fewer than 4 points or values that are not finite.
     """
-    if len(points) < 4 or not (np.isfinite(points).all() and np.isfinite(values).all()):
-        finite = int(np.isfinite(points).all(axis=1).sum())
-        raise problem("initialization", "at least 4 finite points", f"{finite}", "check the poses and the streams")
+    finite = np.isfinite(points).all(axis=1)
+    if len(points) < 4 or not finite.all():
+        found = f"{int(finite.sum())} of {len(points)}"
+        raise problem("initialization", "at least 4 points, all finite", found, "check the poses and the streams")
+    if not np.isfinite(values).all():
+        found = f"{int((~np.isfinite(values)).sum())} others"
+        raise problem("initialization", "finite gray values of the points", found, "check the images")
     distance = cKDTree(points).query(points, k=4)[0][:, 1:].mean(axis=1)  # [N]
     distance = np.maximum(distance, 1e-6 * float(np.ptp(points, axis=0).max()) + 1e-9)  # coincident points
     n = len(points)

@@ -234,7 +234,8 @@ class FittedModel(GaussianModel):
         path = ArrayPath.from_tensors(tensors) if (tensors := file.part("path")) else None
         own: dict[str, Any] = {"pixel_filter": found, "light": light, "path": path}
         made = cls(tuple(pieces), background, motion.to(device), duration_us, device, spec, **own)
-        made.splats(0.0)  # else a tensor that the motion lacks would only be missed at the first render
+        for piece in range(count):  # else what the motion lacks of one would only be missed at a render
+            made.splats(duration_us * piece / count)
         return made
 
 

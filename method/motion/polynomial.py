@@ -13,6 +13,7 @@ fifteen small operations and their gradients cost more than a render of a view.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,12 +31,19 @@ from spike4dgs.method.splat.kernels.jit import kernel
 from spike4dgs.method.splat.kernels.threads import ITEM, run_items
 from spike4dgs.method.splat.kernels.vector_ir import fetch_add
 
+_SIDES: dict[str, tuple[int, ...]] = {  # of what `timed` adds, after the first
+    "times": (),
+    "log_temporal_scales": (),
+    "coefficients": (CUBIC,),
+    "angular_velocities": (4,),
+}
+
 
 @dataclass(frozen=True)
 class PolynomialSettings(Settings):
     """Numbers that all motions on polynomials share. Published rates in brackets, for 30,000 steps."""
 
-    static_temporal_scale: float = 4.0  # of the clip: a Gaussian that fades by 1 % towards the clip's ends [1]
+    static_temporal_scale: float = 4.0  # of the clip: a Gaussian that fades by 1.6 % towards the clip's ends [1]
     lr_times: float = 1e-3  # [1e-4]
     lr_temporal_scales: float = 0.03  # [0.03]
     lr_angular_velocities: float = 1e-3  # [1e-4]
@@ -79,12 +87,17 @@ class PolynomialMotion(Motion):
 
 
 def at_time(gaussians: Gaussians, t: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return means, quaternions, scales and opacities at t, as `Splats` takes them."""
+    """Return means, quaternions, scales and opacities at t, as `Splats` takes them.
+
+    Raises KeyError or ValueError for Gaussians without these parameters, as a file may hold.
+    """
     g, extra = gaussians, gaussians.extra
+    for name, sides in _SIDES.items():
+        if extra[name].shape != (len(g), *sides):
+            raise ValueError(f"{name} of {len(g)} Gaussians is {tuple(extra[name].shape)}")
     if g.means.device.type != "cpu" or g.means.dtype != torch.float32:
         return at_time_reference(g, t)
-    own = ("times", "log_temporal_scales", "coefficients", "angular_velocities")
-    return at_time_cpu((g.means, g.log_scales, g.quats, g.logits, *(extra[name] for name in own)), t)
+    return at_time_cpu((g.means, g.log_scales, g.quats, g.logits, *(extra[name] for name in _SIDES)), t)
 
 
 def at_time_reference(gaussians: Gaussians, t: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -132,24 +145,28 @@ def at_time_cpu(tensors: tuple[Tensor, ...], t: float) -> Four:
     return out
 
 
+def _arrays(tensors: Iterable[Tensor]) -> tuple[Any, ...]:
+    return tuple(x.detach().contiguous().numpy() for x in tensors)
+
+
 class _AtTime(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, t: float, *tensors: Tensor) -> Four:
-        ctx.t, ctx.arrays = np.float32(t), tuple(x.detach().contiguous().numpy() for x in tensors)
-        means, log_scales, quats, logits = ctx.arrays[:4]
+        ctx.t, arrays = np.float32(t), _arrays(tensors)
+        means, log_scales, quats, logits = arrays[:4]
         out = np.empty_like(means), np.empty_like(quats), np.empty_like(log_scales), np.empty_like(logits)
-        run_items(_forward, (ctx.t, *ctx.arrays, *out), len(means))
-        ctx.scales = out[2]
+        run_items(_forward, (ctx.t, *arrays, *out), len(means))
         at_t = tuple(torch.from_numpy(x) for x in out)
+        ctx.save_for_backward(*tensors, at_t[2])
         return at_t[0], at_t[1], at_t[2], at_t[3]
 
     @staticmethod
     def backward(ctx: Any, *outer: Tensor) -> tuple[Any, ...]:
         d_means, d_quats, d_scales, d_opacities = (x.contiguous() for x in outer)
-        _, log_scales, _, logits, times, durations, coefficients, turning = ctx.arrays
+        _, log_scales, _, logits, times, durations, coefficients, turning, scales = _arrays(ctx.saved_tensors)
         own = tuple(np.empty_like(x) for x in (log_scales, logits, times, durations, coefficients, turning))
         given = (x.numpy() for x in (d_means, d_quats, d_scales, d_opacities))
-        arguments = (ctx.t, logits, times, durations, ctx.scales, *given, *own)
+        arguments = (ctx.t, logits, times, durations, scales, *given, *own)
         run_items(_backward, arguments, len(times))
         d_log_scales, *rest = (torch.from_numpy(x) for x in own)
         return None, d_means, d_log_scales, d_quats, *rest

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.splat import cpu
 from spike4dgs.method.splat.cuda.background import Layer as DeviceLayer
 from spike4dgs.method.splat.cuda.background import make_layer, render_over
@@ -36,8 +37,13 @@ class Background:
     def render(self, splats: Splats, chosen: Sequence[int]) -> RenderOutput:
         """Render `splats` [N] and the background into the views `chosen`, differentiable in `splats`; no depth.
 
-        `radii` and `means2d` are those of `splats` alone. Raises UserError for values that are not finite.
+        On the CPU both are projected in float32. `radii` and `means2d` are those of `splats` alone. Raises UserError
+        for values that are not finite, and for another number of channels than the background's.
         """
+        channels, own = splats.colors.shape[1], self.splats.colors.shape[1]
+        if channels != own:
+            fix = "give both the same channels"
+            raise problem("Splats.colors", f"{own} channels, as the background has", f"{channels}", fix)
         if splats.means.device.type != "cpu":
             self._on_device = self._on_device or make_layer(self.splats, self.views, self.pixel_filter)
             return render_over(self._on_device, splats, chosen)

@@ -25,7 +25,15 @@ from spike4dgs.method.splat.kernels.raster import Layer, Lists, raster_kernels, 
 from spike4dgs.method.splat.kernels.threads import aligned, get_threads, run, useful_threads
 from spike4dgs.method.splat.kernels.tiles import AHEAD, BATCH, MAX_BLOCKS
 from spike4dgs.method.splat.kernels.vector_ir import host_lanes
-from spike4dgs.method.splat.types import PixelFilter, RenderOutput, Splats, Views, not_finite, require_finite
+from spike4dgs.method.splat.types import (
+    PixelFilter,
+    RenderOutput,
+    Splats,
+    Views,
+    not_finite,
+    require_finite,
+    require_finite_cameras,
+)
 
 Array = np.ndarray
 
@@ -219,10 +227,13 @@ class _Rasterize(torch.autograd.Function):
         frames = composite(p, packed, chunking(layers)[0], layer, settings)
         ctx.frames, ctx.geometry, ctx.settings = frames, geometry, settings
         ctx.pose_dtype, ctx.colors_dtype, ctx.channels = w2c.dtype, colors.dtype, colors.shape[1]
-        return torch.from_numpy(frames.image[:, :layers]), torch.from_numpy(frames.alpha)
+        image, alpha = torch.from_numpy(frames.image[:, :layers]), torch.from_numpy(frames.alpha)
+        ctx.save_for_backward(means, quats, scales, opacities, colors, image, alpha)
+        return image, alpha
 
     @staticmethod
     def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        _ = ctx.saved_tensors  # the arrays share their memory: torch raises where one was changed since
         frames, posed = ctx.frames, ctx.needs_input_grad[5]
         layers = d_image.numpy()
         if layers.shape != frames.image.shape:
@@ -248,6 +259,7 @@ def render_cpu(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: b
 
 def rasterize(splats: Splats, views: Views, settings: Settings, dtype: torch.dtype, layer: Layer) -> RenderOutput:
     """Render splats, whose geometry is taken as `dtype`, together with a layer in the same views."""
+    require_finite_cameras(views)
     if not torch.isfinite(splats.colors.detach().sum()):  # the geometry is checked while it is projected
         require_finite(splats)
     geometry = [t.to(dtype) for t in splats.geometry]

@@ -31,6 +31,7 @@ from spike4dgs.method.splat.types import (
     Splats,
     Views,
     require_finite,
+    require_finite_cameras,
 )
 
 
@@ -160,6 +161,7 @@ def composite_patch(
 def render_reference(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: bool) -> RenderOutput:
     """Render with the back end "reference": see `render`. Computes in float64, returns the dtype of the colours."""
     require_finite(splats)
+    require_finite_cameras(views)
     dtype, size, n = splats.colors.dtype, (views.width, views.height), len(splats)
     wide = Splats(*(t.double() for t in splats.tensors))
     seen = [project_view(wide, views, c, pixel_filter) for c in range(len(views))]

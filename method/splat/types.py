@@ -163,6 +163,15 @@ def require_finite(splats: Splats) -> None:
             raise not_finite(name, int(bad[0, 0]))
 
 
+def require_finite_cameras(views: Views) -> None:
+    """Raise UserError if a pose or an intrinsic is NaN or infinite: such a camera would see nothing."""
+    for name in ("w2c", "K"):
+        bad = torch.nonzero(~torch.isfinite(getattr(views, name).detach()))
+        if len(bad):
+            found = f"NaN or infinity at camera {int(bad[0, 0])}"
+            raise problem(f"Views.{name}", "finite numbers", found, "check the poses and the calibration")
+
+
 def not_finite(name: str, index: int) -> UserError:
     """Return the error for a parameter that is NaN or infinite."""
     fix = "check for a diverging learning rate or a division by 0"

@@ -8,13 +8,16 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numba
 import pytest
 
 import spike4dgs.benchmark
-from spike4dgs.benchmark.compilation import cached_njit
+from spike4dgs.benchmark.compilation import cached_njit, parts_digest
 from spike4dgs.benchmark.files import user_cache
+from spike4dgs.method.motion import hexplane_cpu, mlp_cpu
+from spike4dgs.method.splat.kernels import vector_ir
 
 TWICE = """
 from spike4dgs.benchmark.compilation import cached_njit
@@ -89,6 +92,20 @@ def plus(x):
 """
 
 
+def changed_parts(folder: Path, texts: list[str]) -> tuple[list[int], list[int]]:
+    """Return kernel(10) of kernel_of_parts.py with each text of parts_of_kernel.py, and the machine codes kept then."""
+    found, counts = [], []
+    for text in texts:
+        (folder / "parts_of_kernel.py").write_text(text)
+        for name in ("kernel_of_parts", "parts_of_kernel"):
+            sys.modules.pop(name, None)
+        shutil.rmtree(folder / "__pycache__", ignore_errors=True)  # its times have whole seconds
+        importlib.invalidate_caches()
+        found.append(importlib.import_module("kernel_of_parts").kernel(10))
+        counts.append(len(list((folder / "cache").rglob("kernel_of_parts*.nbc"))))
+    return found, counts
+
+
 def test_a_kernel_is_compiled_anew_where_another_file_changes_what_is_in_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,16 +113,49 @@ def test_a_kernel_is_compiled_anew_where_another_file_changes_what_is_in_it(
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     (tmp_path / "kernel_of_parts.py").write_text(KERNEL)
-    found, counts = [], []
-    for text in (PARTS, PARTS.replace("SCALE = 2", "SCALE = 7"), PARTS.replace("_ADDED = 1", "_ADDED = 30"), PARTS):
-        (tmp_path / "parts_of_kernel.py").write_text(text)
-        for name in ("kernel_of_parts", "parts_of_kernel"):
-            sys.modules.pop(name, None)
-        shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)  # its times have whole seconds
-        importlib.invalidate_caches()
-        found.append(importlib.import_module("kernel_of_parts").kernel(10))
-        counts.append(len(list((tmp_path / "cache").rglob("kernel_of_parts*.nbc"))))
+    texts = [PARTS, PARTS.replace("SCALE = 2", "SCALE = 7"), PARTS.replace("_ADDED = 1", "_ADDED = 30"), PARTS]
+    found, counts = changed_parts(tmp_path, texts)
     assert found == [21, 71, 50, 21] and counts == [1, 2, 3, 3], "the last is the first one's"
+
+
+INTRINSIC = """
+from numba import types
+from numba.extending import intrinsic
+SCALE = 2
+
+class Code:
+    def sum(self, builder, x):
+        return builder.add(x, x.type(1))
+
+@intrinsic
+def plus(typing, x):
+    def write(context, builder, signature, arguments):
+        return Code().sum(builder, arguments[0])
+
+    return types.int64(types.int64), write
+"""
+
+
+def test_a_kernel_is_compiled_anew_where_an_intrinsic_writes_other_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "kernel_of_parts.py").write_text(KERNEL)
+    found, counts = changed_parts(tmp_path, [INTRINSIC, INTRINSIC.replace("type(1)", "type(5)"), INTRINSIC])
+    assert found == [21, 25, 21] and counts == [1, 2, 2]
+
+
+@pytest.mark.parametrize("kernel", [hexplane_cpu._forward, mlp_cpu._forward], ids=["hexplane", "mlp"])
+def test_kernels_depend_on_the_file_that_builds_their_vectors(
+    kernel: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = parts_digest(kernel._function)
+    assert parts_digest(kernel._function) == before
+    changed = tmp_path / "vector_ir.py"
+    changed.write_text(Path(vector_ir.__file__).read_text() + "# changed")
+    monkeypatch.setattr(vector_ir, "__file__", str(changed))
+    assert parts_digest(kernel._function) != before
 
 
 def test_without_a_folder_to_write_to_nothing_is_kept(install: Path, tmp_path: Path) -> None:

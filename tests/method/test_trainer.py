@@ -61,6 +61,7 @@ def trainer(
     supervision: str = "pixel",
     loss: dict[str, Any] | None = None,
     spans: Any = None,
+    density: DensitySettings | None = None,
     **settings: Any,
 ) -> Trainer:
     scene = WORLD.training
@@ -73,7 +74,8 @@ def trainer(
         training_images = replace(training_images, spans=spans(training_images))
     kind = SUPERVISIONS[supervision]
     compare = kind(replace(kind.defaults, **(loss or {})), scene)
-    gaussians, density = model.initialize(first, training_images), DensitySettings(refine_every=2)
+    gaussians = model.initialize(first, training_images)
+    density = density or DensitySettings(refine_every=2)
     return Trainer(training_images, gaussians, model, compare, s, density, scale=extent.scale, seed=3)
 
 
@@ -208,6 +210,8 @@ def test_a_stage_ends_with_the_mean_of_its_last_steps() -> None:
 def test_nothing_is_averaged_before_the_number_of_gaussians_is_settled() -> None:
     with pytest.raises(UserError, match=r"trainer.average of at most 0.4, as density.refine_stop is 0.6"):
         trainer(average=0.5)
+    for stop, average in ((0.8, 0.2), (0.9, 0.1)):  # 1 - 0.8 is less than 0.2 in floating point
+        trainer(average=average, density=DensitySettings(refine_stop=stop))
 
 
 def tensors(t: Trainer) -> dict[str, torch.Tensor]:
@@ -287,6 +291,19 @@ def test_densification_changed_the_number_of_gaussians():
 def test_unknown_setting_or_wrong_type_is_refused(name, value):
     with pytest.raises(UserError, match=name):
         make_settings({name: value}, "recipe x", TrainerSettings())
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        (TrainerSettings(), "initial_opacity", 0.0),
+        (TrainerSettings(), "initial_opacity", 1.0),
+        (DensitySettings(), "grow_scale3d", 0.0),
+    ],
+)
+def test_numbers_without_a_logarithm_are_refused_where_they_are_given(part, name, value):
+    with pytest.raises(UserError, match=name):
+        make_settings({name: value}, "recipe x", part)
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ class Server(BaseHTTPRequestHandler):
         else:
             self.answer(path, body)
 
-    do_GET = do_PUT = do_POST = do_HEAD = _handle
+    do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = _handle
 
     def allowed(self) -> bool:
         return self.headers.get("Authorization") == f"Bearer {TOKEN}"
@@ -119,8 +119,13 @@ class Zenodo(Server):
             name = path.rpartition("/")[2]
             checksum = hashlib.md5(self.store(name, body)).hexdigest()
             others = [f for f in host.draft["files"] if f["filename"] != name]
-            host.draft["files"] = [*others, {"filename": name, "checksum": checksum, "filesize": len(body)}]
+            host.draft["files"] = [*others, {"id": f"f-{name}", "filename": name, "checksum": checksum}]
             self.send_json({"key": name, "checksum": f"md5:{checksum}", "size": len(body)}, 201)
+        elif self.command == "DELETE" and path.startswith(f"{api}/7/files/f-") and host.draft:
+            name = path.rpartition("/f-")[2]
+            del host.files[name]
+            host.draft["files"] = [f for f in host.draft["files"] if f["filename"] != name]
+            self._send(204)
         else:
             self.send_json({"message": "no such thing"}, 404)
 
@@ -132,8 +137,11 @@ class Hub(Server):
         return self.path.startswith("/lfs/") or super().allowed()  # an upload address is signed
 
     def answer(self, path: str, body: bytes) -> None:
+        files = self.received.files
         if path == "/api/repos/create":
             self.send_json({"url": f"http://{self.headers['Host']}/datasets/owner/name", "id": "owner/name"})
+        elif path == "/api/datasets/owner/name/tree/main":
+            self.send_json([{"type": "file", "path": p, "size": len(f), "oid": "0"} for p, f in files.items()])
         elif path == "/api/validate-yaml":
             self.send_json({"errors": [], "warnings": []})
         elif path.endswith("/preupload/main"):
@@ -154,10 +162,12 @@ class Hub(Server):
             self._send(200)
         elif path.endswith("/commit/main"):
             for line in map(json.loads, body.splitlines()):
-                if line["key"] == "file":
-                    self.received.files[line["value"]["path"]] = base64.b64decode(line["value"]["content"])
+                if line["key"] == "deletedFile":
+                    del files[line["value"]["path"]]
+                elif line["key"] == "file":
+                    files[line["value"]["path"]] = base64.b64decode(line["value"]["content"])
                 elif line["key"] == "lfsFile":
-                    self.received.files[line["value"]["path"]] = self.received.files.pop(line["value"]["oid"])
+                    files[line["value"]["path"]] = files.pop(line["value"]["oid"])
             commit = {"commitUrl": "http://127.0.0.1/owner/name/commit/1", "commitOid": "1", "pullRequestUrl": None}
             self.send_json(commit | {"success": True})
         else:

@@ -26,7 +26,14 @@ from spike4dgs.method.splat.cuda.prepare import (
     simulated,
     sort_pairs,
 )
-from spike4dgs.method.splat.types import PixelFilter, RenderOutput, Splats, Views, require_finite
+from spike4dgs.method.splat.types import (
+    PixelFilter,
+    RenderOutput,
+    Splats,
+    Views,
+    require_finite,
+    require_finite_cameras,
+)
 
 THREADS = TILE * TILE  # of a block: one for each pixel
 MAX_CHANNELS = 4  # of one kernel call, which keeps them in registers
@@ -137,8 +144,11 @@ class Projected:
 
 def project_splats(splats: Splats, views: Views, pixel_filter: PixelFilter) -> Projected:
     """Project splats and make the tensor that receives dL/dmeans2d. Raises UserError for NaN."""
-    if not torch.isfinite(torch.stack([t.detach().sum().double() for t in splats.tensors]).sum()):
+    if not torch.isfinite(
+        torch.stack([t.detach().sum().double() for t in (*splats.tensors, views.w2c, views.K)]).sum()
+    ):
         require_finite(splats)
+        require_finite_cameras(views)
     seen = project(splats, views, pixel_filter)
     wide = any(t.dtype == torch.float64 for t in splats.geometry)
     shape, at = (len(views), len(splats)), (seen.view, seen.index)

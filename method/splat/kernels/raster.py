@@ -1,6 +1,6 @@
 """The tile jobs: sort a tile's Gaussians, list the blocks each meets, and composite or differentiate them.
 
-Large tiles keep sorting cheap, as Gaussians visit only the blocks that they meet (blocks.py). Behind and between the
+Large tiles keep sorting cheap, as Gaussians visit only the blocks that they meet (tiles.py). Behind and between the
 Gaussians there may be a `Layer` of others that never change: their sorted lists are merged on the way.
 """
 
@@ -34,7 +34,7 @@ class Lists(NamedTuple):
     records: np.ndarray  # [V, N * 8] float64
     keys: np.ndarray  # [V, N] uint32: depth bits
     colors: np.ndarray  # [V or 1, chunks, N * channels] float32
-    order: np.ndarray  # [P + AHEAD] int32, the Gaussians' indices
+    order: np.ndarray  # [P] int32, the Gaussians' indices
     offsets: np.ndarray  # [V * tiles + 1] int64, of each tile's pairs
 
 

@@ -60,9 +60,19 @@ def test_the_limits_of_the_host(copy: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert any("a b.txt: a name of other characters" in line for line in find_problems(copy))
 
 
-@pytest.mark.parametrize("text", ["# No card\n", "---\nlicense: [\n---\n", "---\ntags: []\n---\n# No licence\n"])
-def test_a_card_without_facts_is_found(text: str, copy: Path) -> None:
-    (copy / "README.md").write_text(text)
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"# No card\n",
+        b"---\nlicense: [\n---\n",
+        b"---\ntags: []\n---\n# No licence\n",
+        b"---\nlicense: " + b"[" * 20_000 + b"\n---\n",
+        b"---\nlicense: &a [mit]\ntags: [*a, *a]\n---\n",  # a few such lines stand for more than memory holds
+        b"---\nlicense: \xff\n---\n",
+    ],
+)
+def test_a_card_without_facts_is_found(text: bytes, copy: Path) -> None:
+    (copy / "README.md").write_bytes(text)
     resum(copy)
     assert [line.split(": ")[0] for line in find_problems(copy)] == [str(copy / "README.md")]
 

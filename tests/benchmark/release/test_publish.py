@@ -83,15 +83,26 @@ def test_zenodo_is_sent_only_what_it_lacks(flat: Path) -> None:
         assert host.requests.count("POST /api/deposit/depositions") == 1
 
 
-def test_the_hub_gets_a_dataset_of_every_file(release_folder: Path) -> None:
+def test_a_draft_loses_what_an_earlier_try_left_there(flat: Path) -> None:
+    with serve_uploads(Zenodo) as (address, host):
+        assert main(["release", "publish", str(flat), "--to", f"zenodo+{address}"]) == 0
+        assert host.draft is not None
+        host.draft["files"].append({"id": "f-spike4dgs-1-00099.tar", "filename": "spike4dgs-1-00099.tar"})
+        host.files["spike4dgs-1-00099.tar"] = b"of other scenes"
+        assert main(["release", "publish", str(flat), "--to", f"zenodo+{address}"]) == 0
+    assert host.files == contents(flat)
+
+
+def test_the_hub_gets_a_dataset_of_every_file_and_keeps_no_other_shard(release_folder: Path) -> None:
     with serve_uploads(Hub) as (address, host):
+        host.files = {"shards/000/spike4dgs-1-00099.tar": b"of other scenes", ".gitattributes": b"of the host"}
         told = {"HF_ENDPOINT": address, "HF_TOKEN": TOKEN, "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1"}
         command = ["release", "publish", str(release_folder), "--to", "hf://datasets/owner/name"]
         done = subprocess.run(  # the client reads the variables when it is imported
             [sys.executable, "-m", "spike4dgs.cli", *command], env=os.environ | told, capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
-    assert host.files == contents(release_folder)
+    assert host.files == {**contents(release_folder), ".gitattributes": b"of the host"}
     assert "download all --from hf://datasets/owner/name" in done.stdout
 
 

@@ -67,6 +67,23 @@ def test_a_body_without_an_end_is_an_error(tmp_path: Path, read: str, monkeypatc
             tracemalloc.stop()
 
 
+def test_a_file_that_is_too_large_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(source, "MOST_BODY", 1 << 20)
+    for size, refused in ((1 << 20, False), (1 << 30, True)):
+        with open(tmp_path / "index.json", "wb") as file:
+            file.truncate(size)
+        tracemalloc.start()
+        try:
+            if refused:
+                with pytest.raises(UserError, match="an answer of more than 1 MiB"):
+                    Source(str(tmp_path)).read_all("index.json")
+            else:
+                assert len(Source(str(tmp_path)).read_all("index.json")) == size
+            assert tracemalloc.get_traced_memory()[1] < 8 << 20
+        finally:
+            tracemalloc.stop()
+
+
 def test_packed_bytes_stay_packed(tmp_path: Path) -> None:
     with serve(tmp_path, handler=Bomb) as (address, _):
         data = Source(address).read_all("index.json")

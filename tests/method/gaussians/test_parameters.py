@@ -61,8 +61,14 @@ def test_coincident_points_get_a_positive_size():
 
 @pytest.mark.parametrize("points", [np.zeros((3, 3)), np.full((10, 3), np.nan)])
 def test_too_few_or_infinite_points_are_refused(points):
-    with pytest.raises(UserError, match="at least 4 finite points"):
+    with pytest.raises(UserError, match="at least 4 points, all finite"):
         from_points(points.astype(np.float32), np.zeros(len(points), np.float32), opacity=0.5)
+
+
+def test_gray_values_that_are_not_finite_are_named():
+    values = np.array([0, np.nan, 1, np.inf, 0], np.float32)
+    with pytest.raises(UserError, match="finite gray values of the points, found 2 others"):
+        from_points(np.eye(5, 3, dtype=np.float32), values, opacity=0.5)
 
 
 def test_decay_is_log_linear():

@@ -246,6 +246,26 @@ def test_a_model_of_another_version_is_one_clear_error(saved: Path, change: Any,
     refused(saved, message)
 
 
+def of_another_shape(name: str, shape: tuple[int, ...]) -> Any:
+    def change(tensor: torch.Tensor) -> torch.Tensor:
+        return tensor.reshape(len(tensor), -1)[:, :1].expand(len(tensor), shape[0]).contiguous()
+
+    return lambda f: {"tensors": {k: change(v) if k == f"piece0.{name}" else v for k, v in f.tensors.items()}}
+
+
+@pytest.mark.parametrize(("name", "shape"), [("paths", (8,)), ("paths", (1,)), ("times", (1,)), ("spins", (3,))])
+def test_paths_of_another_shape_are_refused(name: str, shape: tuple[int, ...], tmp_path: Path) -> None:
+    """The kernels take the shapes for granted, and would read what lies behind the tensors."""
+    path = tmp_path / "m.safetensors"
+    model("paths").save(path, provenance())
+    file = read_model(path)
+    assert f"piece0.{name}" in file.tensors
+    write_model(
+        path, ModelFile(file.kind, file.config, of_another_shape(name, shape)(file)["tensors"], file.provenance)
+    )
+    refused(path, rf"cannot read .ValueError: \w+ of \d+ Gaussians is \(\d+, {shape[0]}\)")
+
+
 class Kept(CountMethod):
     """Its models can be saved."""
 

@@ -97,6 +97,12 @@ def test_a_view_that_comes_back_gets_a_background_of_its_own() -> None:
     assert repeated.in_view(one[0]) is None, "too long ago"
 
 
+def test_another_number_of_channels_is_refused() -> None:
+    background = Background(random_splats(20, channels=1), views(1))
+    with pytest.raises(UserError, match="expected 1 channels, as the background has, found 2"):
+        background.render(random_splats(20, channels=2), [0])
+
+
 def test_values_that_are_not_finite_are_refused() -> None:
     splats, v = rows(random_splats(20, seed=3), torch.arange(20)), views(1)
     background = Background(splats, v)

@@ -19,6 +19,7 @@ from splat_scenes import HARD, changed, far_origin, random_splats, views
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.splat import PixelFilter, Splats, Views, cpu, render, set_threads
+from spike4dgs.method.splat.api import Backend
 from spike4dgs.method.splat.kernels.threads import work_alone
 
 SUPPORT = Path(splat_parity.__file__).parent
@@ -125,6 +126,26 @@ def test_one_line_errors() -> None:
         for backend in ("cpu", "reference"):
             with pytest.raises(UserError, match="finite"):
                 render(changed(s, **{name: broken}), v, backend=backend)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["w2c", "K"])
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_a_camera_that_is_not_finite_is_no_empty_image(name: str, backend: Backend) -> None:
+    v = views()
+    broken = {n: getattr(v, n).clone() for n in ("w2c", "K")}
+    broken[name][1, 0, 0] = float("nan")
+    with pytest.raises(UserError, match=f"Views.{name}: expected finite numbers, found NaN or infinity at camera 1"):
+        render(random_splats(5), Views(**broken, width=v.width, height=v.height), backend=backend)
+
+
+def test_an_image_that_was_changed_in_place_has_no_wrong_gradient() -> None:
+    """The kernels' gradient is made from the image; torch must notice that it is another one now."""
+    splats = random_splats(60)
+    splats = Splats(*(t.requires_grad_() for t in splats.tensors))
+    image = render(splats, views(), backend="cpu").image
+    image += 0.5
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        image.square().sum().backward()
 
 
 def test_a_second_process_compiles_nothing() -> None:
