@@ -28,11 +28,17 @@ from spike4dgs.benchmark.release.scenes import track_folders
 from spike4dgs.benchmark.reports.benchmark import SplitRun, run_split
 from spike4dgs.benchmark.reports.console import Columns, make_console
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
-from spike4dgs.benchmark.reports.paper_tables import IMAGE_TABLE, POSES, PublishedTable, published, table_scenes
+from spike4dgs.benchmark.reports.paper_tables import (
+    IMAGE_TABLE,
+    POSES,
+    PublishedTable,
+    over_seeds,
+    published,
+    table_scenes,
+)
 from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.record import Record, of_scenes
 from spike4dgs.benchmark.runs.refinement import SUFFIX
-from spike4dgs.benchmark.runs.results import of_one_seed
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scenes
 from spike4dgs.cli.options import From, SetValues
@@ -180,7 +186,7 @@ def _run_table(paper: PublishedTable, choice: SceneChoice, fits: FitChoice, entr
     shown = []
     for run, records in zip(runs, rows, strict=True):
         ids = {scene.id for scene in run.scenes}  # not those of earlier runs
-        shown.append((run.scenes, of_one_seed([of_scenes(record, ids) for record in records])))
+        shown.append((run.scenes, over_seeds([of_scenes(record, ids) for record in records])))
     folder = fits.out if len(runs) > 1 else runs[0].settings.out
     worlds = {path.name: world for path, world in zip(scenes, paper.worlds, strict=True)}
     write_paper_table(paper, in_every_split(shown), worlds, select_metrics(fits.metrics).metrics, folder)

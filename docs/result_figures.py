@@ -17,6 +17,7 @@ from PIL import Image
 
 from spike4dgs.benchmark import open_scene
 from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.method import make_budget
 from spike4dgs.benchmark.metrics.covisible import covisible as find_covisible
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.measure import measure
@@ -29,11 +30,10 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT, Target
 from spike4dgs.studies.results.blocks import NINE, of_group
 from spike4dgs.studies.results.comparison import RANKED_BY, rows_of
-from spike4dgs.studies.results.plan import TABLE1, UNPOSED, Group
+from spike4dgs.studies.results.plan import CEILING, TABLE1, UNPOSED, Group
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.tables import conditions as on_conditions
 from spike4dgs.studies.results.tables.breaks import LEVELS, NAMED, amount_text
-from spike4dgs.studies.results.tables.ceilings import ROW as CEILING
 from spike4dgs.studies.results.tables.ceilings import ceiling_row
 from spike4dgs.studies.results.tables.conditions import NONE, Condition, rows_under
 from spike4dgs.studies.results.tables.modality import plot_modality
@@ -56,6 +56,7 @@ TFP_TICKS = 40
 MEASURED = {"psnr": "PSNR, dB", RANKED_BY: "PSNR where things move, dB"}
 SHOWN_CONDITIONS = ("light 1/16", "four times as fast", "5 of 8 cameras")
 SHEET_WIDTH = 1500  # pixels
+QUICK = make_budget("quick").label
 
 
 def images(strip: Path, out: Path) -> None:
@@ -215,7 +216,12 @@ def sheets(sweep: Path, scenes: Path, out: Path) -> None:
 
 
 def _predictions(sweep: Path, row: str, scene: str, split: str = DEFAULT_SPLIT) -> Path | None:
-    return next(sweep.glob(f"*/quick-{split}/seed-0/predictions/{row}/{scene}"), None)
+    """Return the predictions of a row's record with seed 0, which are in the folder of the code that made it."""
+    for r in read_records(RECORDS).values():
+        if (r["row"], r["scene"], r["split"], r["budget"], r["seed"]) == (row, scene, split, QUICK, 0):
+            folder = sweep / r["code"] / f"quick-{split}" / "seed-0" / "predictions" / row / scene
+            return folder if folder.is_dir() else None
+    return None
 
 
 def _record(row: str, scene: Scene, folder: Path) -> dict[str, Any]:

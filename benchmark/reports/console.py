@@ -16,6 +16,7 @@ from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import MAIN, METRICS
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record
+from spike4dgs.benchmark.runs.refinement import SUFFIX
 
 SHORT = (*MAIN, "fit_seconds", "render_fps")  # columns by default
 WIDE = 240  # characters that hold every column
@@ -140,16 +141,20 @@ def blocks_of(
     return metrics, costs, blocks
 
 
+def _has_rank(row: _Row) -> bool:
+    return not row.name.endswith(SUFFIX)  # a method has one: without refined held-out poses
+
+
 def _block(title: str, metrics: Sequence[Metric], costs: Sequence[str], rows: Sequence[_Row]) -> Block:
-    best: dict[str, float] = {}
+    best, ranked = dict[str, float](), [row for row in rows if _has_rank(row)]
     for m in metrics:
-        known = [v for row in rows if (v := row.mean(m.id)) is not None]
-        if known and len(rows) > 1:
+        known = [v for row in ranked if (v := row.mean(m.id)) is not None]
+        if known and len(ranked) > 1:
             best[m.id] = max(known) if m.higher_is_better else min(known)
     made = []
     for row in rows:
         failed = sorted({cell["status"] for cell in row.cells} - {"ok"})
-        values = [(row.text(m), row.mean(m.id) == best.get(m.id, "")) for m in metrics]
+        values = [(row.text(m), _has_rank(row) and row.mean(m.id) == best.get(m.id, "")) for m in metrics]
         shown = [(row.cost(key, COSTS[key][1]), False) for key in costs]
         made.append((row.name + (f" ({', '.join(failed)})" if failed else ""), [*values, *shown]))
     return Block(title, made)

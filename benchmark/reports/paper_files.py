@@ -15,6 +15,7 @@ from spike4dgs.benchmark.reports.console import blocks_of
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, build_table, truth_scores
 from spike4dgs.benchmark.reports.scatter import write_views
 from spike4dgs.benchmark.runs.record import COSTS, Record, dataset_means
+from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.scene.scene import Scene
 
 Table = Mapping[str, Any]  # from `paper_tables.build_table`
@@ -94,7 +95,7 @@ def _summary(table: Table, mark: Mark) -> tuple[str, list[str], list[list[str]]]
     for m in table["metrics"]:
         cells = [r["mean"][m["id"]] for r in table["rows"]]
         header.append(m["title"])
-        columns.append(_marked([c["value"] for c in cells], m["id"], mark))
+        columns.append(_marked(table, [c["value"] for c in cells], m["id"], mark))
         if any(c["published"] is not None for c in cells):
             header += [f"{m['title']}, published", "rank / published"]
             columns.append([METRICS[m["id"]].format(c["published"]) for c in cells])
@@ -118,7 +119,7 @@ def _metric_blocks(table: Table, mark: Mark) -> list[tuple[str, list[str], list[
             cells = [r["scenes"][scene]["values"][m["id"]] for r in table["rows"]]
             truth = [METRICS[m["id"]].format(table["truth"][scene][m["id"]])] if scored else []
             header.append(world)
-            columns.append(_marked([c["value"] for c in cells], m["id"], mark) + truth)
+            columns.append(_marked(table, [c["value"] for c in cells], m["id"], mark) + truth)
             if any(c["published"] is not None for c in cells):
                 header.append("published")
                 columns.append([METRICS[m["id"]].format(c["published"]) for c in cells] + ["-"] * len(last))
@@ -126,10 +127,15 @@ def _metric_blocks(table: Table, mark: Mark) -> list[tuple[str, list[str], list[
     return blocks
 
 
-def _marked(values: Sequence[float | None], metric: str, mark: Mark) -> list[str]:
-    m = METRICS[metric]
-    best = sorted({v for v in values if v is not None}, reverse=m.higher_is_better)[:2]
-    return [mark(m.format(v), best.index(v)) if v is not None and v in best else m.format(v) for v in values]
+def _marked(table: Table, values: Sequence[float | None], metric: str, mark: Mark) -> list[str]:
+    """Return the rows' values with marks of the best two; a row of refined held-out poses has no mark, as no rank."""
+    m, ranked = METRICS[metric], [not r["method"].endswith(SUFFIX) for r in table["rows"]]
+    pairs = list(zip(values, ranked, strict=True))
+    best = sorted({v for v, counts in pairs if counts and v is not None}, reverse=m.higher_is_better)[:2]
+    return [
+        mark(m.format(v), best.index(v)) if counts and v is not None and v in best else m.format(v)
+        for v, counts in pairs
+    ]
 
 
 def _reasons(table: Table) -> list[str]:

@@ -19,6 +19,7 @@ from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.metrics.measure import mean, measure
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import COSTS, Record
 from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.scene.scene import Scene
@@ -181,8 +182,25 @@ def _row(table: PublishedTable, record: Record, worlds: Mapping[str, str]) -> di
             }
         scenes[scene] = {"status": cell["status"], "values": values, **{k: cell.get(k) for k in COSTS}}
     means = {m: {"value": record["mean"][m], "published": table.mean(name, m)} for m in columns}
-    costs = {k: mean(v for c in scenes.values() if (v := c[k]) is not None) for k in COSTS}
+    costs = {k: mean(c[k] for c in scenes.values()) for k in COSTS}
     return {"method": name, "scenes": scenes, "mean": means, "costs": costs}
+
+
+def over_seeds(records: Sequence[Record]) -> list[Record]:
+    """Return one record for each method: the means over its seeds. A cell that failed with a seed is that seed's."""
+    return [_mean_of(seeds) for seeds in seeds_of_methods(records)]
+
+
+def _mean_of(seeds: Sequence[Record]) -> Record:
+    found = {}
+    for scene, first in seeds[0]["scenes"].items():
+        cells = [r["scenes"][scene] for r in seeds if scene in r["scenes"]]
+        metrics = {metric: mean(cell["metrics"][metric] for cell in cells) for metric in first["metrics"]}
+        costs = {cost: mean(cell.get(cost) for cell in cells) for cost in COSTS}
+        failed = [cell for cell in cells if cell["status"] != "ok"]
+        found[scene] = failed[0] if failed else {**first, "metrics": metrics, **costs}
+    means = {metric: mean(r["mean"][metric] for r in seeds) for metric in seeds[0]["mean"]}
+    return {**seeds[0], "scenes": found, "mean": means}
 
 
 def ranks(values: Sequence[float | None], metric: Metric) -> list[int | None]:

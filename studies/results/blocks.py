@@ -11,7 +11,7 @@ from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
 from spike4dgs.method.recipes import METHODS as OURS
 from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.comparison import BOTH, RANKED_BY, MeasuredRow, Ranking, changes, lead, rank, rows_of
+from spike4dgs.studies.results.comparison import BOTH, RANKED_BY, MeasuredRow, Ranking, lead, rank, rows_of
 from spike4dgs.studies.results.plan import ALL_ROWS, KNOWLEDGE, TABLE1, TABLE2, Group, cells_of
 from spike4dgs.studies.results.records import DIGITS, Record
 
@@ -196,12 +196,6 @@ def psnr_texts(row: MeasuredRow, scene: str, metrics: Sequence[str] = BOTH) -> s
 def both_text(row: MeasuredRow) -> str:
     """Return PSNR of the whole image and where things move, means over scenes and seeds; "-" of an incomplete row."""
     return " / ".join(metric_text(row.mean(metric), 2) for metric in BOTH) if row.is_complete else "-"
-
-
-def change_text(row: MeasuredRow, other: MeasuredRow) -> str:
-    """Return `changes` as `both_text` has values; "-" where there are none."""
-    found = changes(row, other)
-    return "-" if found is None else " / ".join(f"{change:+.2f}" for change in found)
 
 
 def _lead_text(row: MeasuredRow, rivals: Sequence[MeasuredRow]) -> str:

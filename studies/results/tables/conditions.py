@@ -17,7 +17,8 @@ from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT
 from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.worlds import HARD
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance, psnr_texts
+from spike4dgs.studies.results.blocks import NOTHING, both_text, of_group, provenance, psnr_texts
+from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import BOTH, MeasuredRow, rows_of
 from spike4dgs.studies.results.plan import CEILING, NOT_TUNED, OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
@@ -136,7 +137,8 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
         f"others its change; a prediction without error has the PSNR of the {_NOISE}."
     )
-    return [*markdown(heads, lines), "", " ".join([legend, *_seeds(names, own)]), "", provenance(own, *EVERY)]
+    text = " ".join([legend_of(legend, lines), *_seeds(names, own)])
+    return [*markdown(heads, lines), "", text, "", provenance(own, *EVERY)]
 
 
 def of_conditions(records: Sequence[Record]) -> list[Record]:

@@ -8,7 +8,8 @@ from pathlib import Path
 from spike4dgs.benchmark.method import get_method
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.modality.command import COLUMNS, MEAN, ROWS, Row, plot, value_text
-from spike4dgs.studies.results.blocks import NOTHING, behind_texts, both_text, change_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NOTHING, behind_texts, both_text, of_group, provenance
+from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import MeasuredRow, Ranking, rank, rows_of
 from spike4dgs.studies.results.plan import PLAN, Group, once
 from spike4dgs.studies.results.records import Record
@@ -57,7 +58,8 @@ def noisy_block(records: Sequence[Record]) -> list[str]:
     before = rows_of([row.name for row in noisy], scenes, of_group(GROUP, records))
     lines = [[f"`{a.name}`", both_text(b), change_text(a, b)] for a, b in zip(noisy, before, strict=True)]
     legend = "PSNR of the whole image / where things move, dB, on car. The cells without noise are of the table above."
-    return [*markdown(("row", "without noise", "with it"), lines), "", legend, "", provenance(own, NOISY)]
+    heads = ("row", "without noise", "with it")
+    return [*markdown(heads, lines), "", legend_of(legend, lines), "", provenance(own, NOISY)]
 
 
 def plot_modality(path: Path, records: Sequence[Record]) -> None:

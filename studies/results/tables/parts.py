@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, change_text, metric_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, metric_text, of_group, provenance
+from spike4dgs.studies.results.changes import change_text
 from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record

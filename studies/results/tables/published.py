@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from statistics import fmean
 
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published, ranks
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, change_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, of_group, provenance
+from spike4dgs.studies.results.changes import change_text
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, differences, rows_of
 from spike4dgs.studies.results.plan import TABLE1, TABLE5, UNPOSED, Group, once
 from spike4dgs.studies.results.records import Record
@@ -45,8 +46,7 @@ def published_block(group: Group, number: int, records: Sequence[Record]) -> lis
     ]
     heads = ("row", "PSNR, moving", "PSNR", "published", "rank / published", "SSIM", "published", "rank / published")
     taus = [f"Kendall's tau with the published order: {', '.join(agreement)}.", ""] if agreement else []
-    measured = [r for r in own if r["row"] in {row.name for row in rows}]
-    return [*markdown(heads, lines), "", *taus, provenance(measured, group)]
+    return [*markdown(heads, lines), "", *taus, _provenance(own, group, rows)]
 
 
 def _compared(
@@ -122,8 +122,7 @@ def pairs_block(records: Sequence[Record]) -> list[str]:
     if not lines:
         return [NOTHING]
     heads = ("row", "against", "PSNR, dB", "scenes ahead", "where things move, dB", "scenes ahead")
-    measured = [r for r in own if r["row"] in rows]
-    return [*markdown(heads, lines), "", provenance(measured, NINE)]
+    return [*markdown(heads, lines), "", _provenance(own, NINE, rows.values())]
 
 
 def _pair(one: MeasuredRow, other: MeasuredRow) -> list[str]:
@@ -132,6 +131,13 @@ def _pair(one: MeasuredRow, other: MeasuredRow) -> list[str]:
     for each in (differences(one, other, metric) for metric in ("psnr", RANKED_BY)):
         texts += [f"{fmean(each):+.2f}", str(sum(x > 0 for x in each))]
     return [f"`{one.name}`", f"`{other.name}`", *texts]
+
+
+def _provenance(own: Sequence[Record], group: Group, shown: Iterable[MeasuredRow]) -> str:
+    """Return `provenance` of the rows that are shown alone."""
+    names = {row.name for row in shown}
+    rows = tuple(row for row in group.rows if row.name in names)
+    return provenance([r for r in own if r["row"] in names], replace(group, rows=rows))
 
 
 def _names(group: Group) -> list[str]:

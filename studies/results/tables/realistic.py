@@ -8,15 +8,8 @@ from dataclasses import replace
 from spike4dgs.benchmark.variants import PUBLIC_VARIANT
 from spike4dgs.generators.worlds import OURS
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import (
-    NINE,
-    NOTHING,
-    both_text,
-    change_text,
-    of_group,
-    provenance,
-    table_block,
-)
+from spike4dgs.studies.results.blocks import NOTHING, both_text, of_group, provenance, table_block
+from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import Group, track_scenes
 from spike4dgs.studies.results.records import Record
@@ -66,9 +59,7 @@ def cameras_block(records: Sequence[Record]) -> list[str]:
         "blur leaves less to get wrong: compare rows within a column."
     )
     complete = {r.name for r, _ in rows}
-    groups = [
-        replace(group, scenes=tuple(scenes), rows=tuple(row for row in group.rows if row.name in complete))
-        for group, scenes in ((GROUP, pairs), (NINE, pairs.values()))
-    ]
+    shown_rows = tuple(row for row in GROUP.rows if row.name in complete)
+    groups = [replace(GROUP, scenes=tuple(scenes), rows=shown_rows) for scenes in (pairs, pairs.values())]
     shown = [record for group in groups for record in of_group(group, records)]
-    return [*markdown(heads, lines), "", legend, "", provenance(shown, *groups)]
+    return [*markdown(heads, lines), "", legend_of(legend, lines), "", provenance(shown, *groups)]

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from spike4dgs.benchmark.method import DEFAULT_BUDGET
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, both_text, change_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NOTHING, both_text, of_group, provenance
+from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import Group, once
 from spike4dgs.studies.results.records import Record
@@ -41,6 +42,6 @@ def steps_block(records: Sequence[Record]) -> list[str]:
     legend = f"Whole image / where things move, dB; means of {', '.join(SCENES)}. More steps are listed as changes."
     return [
         *markdown(("row", "steps of tables", "4 times", "16 times"), lines),
-        *("", legend, ""),
+        *("", legend_of(legend, lines), ""),
         provenance(sum(own, []), *GROUPS),
     ]

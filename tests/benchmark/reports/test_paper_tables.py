@@ -21,16 +21,19 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import find_methods
 from spike4dgs.benchmark.metrics.iqa.brisque import brisque
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.reports.console import blocks_of
 from spike4dgs.benchmark.reports.paper_files import to_csv, to_latex, to_markdown, write_table
 from spike4dgs.benchmark.reports.paper_tables import (
     build_table,
     kendall_tau,
+    over_seeds,
     published,
     ranks,
     table_columns,
     table_scenes,
     truth_scores,
 )
+from spike4dgs.benchmark.runs.record import COSTS
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.cli import run_benchmark as run_command
@@ -147,6 +150,49 @@ def test_refined_rows_take_no_rank_from_others(small_scene: Path, tmp_path: Path
     last = {**records[2], "mean": {**records[2]["mean"], "psnr": records[2]["mean"]["psnr"] - 1}}
     rows = build_table(published(1), [*records[:2], last], {scene: "car" for scene in last["scenes"]})["rows"]
     assert rows[2]["mean"]["psnr"]["rank"] == 2
+
+
+def test_refined_rows_have_no_mark(small_scene: Path, tmp_path: Path) -> None:
+    """As they have no rank: the best row that has one is marked."""
+    records = run(tmp_path / "out", [small_scene], CountMethod("tfi+4dgs"), CountMethod("tfi+4dgs.refined"))
+    better = {**records[1], "mean": {**records[1]["mean"], "psnr": records[0]["mean"]["psnr"] + 1}}
+    content = build_table(published(1), [records[0], better], {scene: "car" for scene in better["scenes"]})
+    lines = {line.split(" | ")[0]: line for line in to_markdown(content).split("## ")[1].splitlines()}
+    assert "**" in lines["| tfi+4dgs"] and "**" not in lines["| tfi+4dgs.refined"] and "<u>" not in "".join(lines)
+    _, _, blocks = blocks_of([records[0], better, {**records[0], "method": records[0]["method"] | {"name": "other"}}])
+    bold = {name: any(best for _, best in values) for name, values in blocks[-1].rows}
+    assert bold == {"tfi+4dgs": True, "tfi+4dgs.refined": False, "other": True}
+
+
+def test_costs_of_a_row_with_a_failed_scene_are_no_means_of_the_others(table: dict[str, Any]) -> None:
+    rows = {row["method"]: row for row in table["rows"]}
+    assert rows["tfi+4dgs"]["costs"]["fit_seconds"] is not None
+    (record,) = [{"method": {"name": "tfi+4dgs"}, "scenes": {}, "mean": dict.fromkeys(METRICS)}]
+    cell = {"metrics": dict.fromkeys(METRICS), "notes": {}, "error": "e", "status": "ok", **dict.fromkeys(COSTS, 40.0)}
+    failed = {**cell, "status": "failed", **dict.fromkeys(COSTS)}
+    record["scenes"] = {"a": cell, "b": failed}
+    content = build_table(
+        published(1), [{**record, "dataset": {}, "harness": {}, "environment": {}}], {"a": "car", "b": "van"}
+    )
+    assert content["rows"][0]["costs"] == dict.fromkeys(COSTS)
+
+
+def test_a_table_of_several_seeds_has_their_means(small_scene: Path, tmp_path: Path) -> None:
+    (record,) = run(tmp_path / "out", [small_scene], CountMethod("tfi+4dgs"))
+    (scene,) = record["scenes"]
+
+    def with_seed(seed: int, psnr: float | None, status: str = "ok") -> dict[str, Any]:
+        cell = {**record["scenes"][scene], "status": status, "fit_seconds": 10.0 * seed}
+        cell["metrics"] = {**cell["metrics"], "psnr": psnr}
+        mean = {**record["mean"], "psnr": psnr}
+        return {**record, "method": {**record["method"], "seed": seed}, "scenes": {scene: cell}, "mean": mean}
+
+    (found,) = over_seeds([with_seed(0, 30.0), with_seed(1, 34.0), with_seed(2, 35.0)])
+    assert found["mean"]["psnr"] == found["scenes"][scene]["metrics"]["psnr"] == 33.0
+    assert found["scenes"][scene]["fit_seconds"] == 10.0
+    assert found["mean"]["ssim"] == record["mean"]["ssim"]
+    (found,) = over_seeds([with_seed(0, 30.0), with_seed(1, None, "failed")])
+    assert found["mean"]["psnr"] is None and found["scenes"][scene]["status"] == "failed"
 
 
 def test_files_say_the_same(table: dict[str, Any], tmp_path: Path) -> None:
