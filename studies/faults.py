@@ -16,7 +16,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from spike4dgs.baselines.images.tfp import TFP
-from spike4dgs.benchmark.environment import command_line, environment, harness
+from spike4dgs.benchmark.environment import command_line, device_type, environment, harness
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, choose_device_for, get_method, make_budget
@@ -116,11 +116,13 @@ def fault_table(
     """
     truth = _with_truth(scene)
     curved = None if lens_scene is None else _with_truth(lens_scene)
+    chosen = choose_device_for([get_method(name) for name in methods], device)
     of = {"scene": truth.revision, "budget": make_budget(budget).label, "seed": seed, "code": code_now()}
+    of["device"] = device_type(chosen)
     _check_same(out / "about.json", of | ({"lens_scene": curved.revision} if curved else {}))
     found: list[Outcome] = []
     about = {"scene": truth.id, "budget": budget, "seed": seed, "command": command_line(), "harness": harness()}
-    about["environment"] = environment("cpu")
+    about["environment"] = environment(chosen)
     for case in (*CASES, *(LENS_CASES if curved else ())):
         shown = curved if curved and case.lens else truth
         capture = out / "captures" / case.name
@@ -128,7 +130,7 @@ def fault_table(
         for method in methods:
             folder = out / "fits" / case.name / method
             wanted = get_method(method)
-            request = FitRequest(make_budget(budget), choose_device_for([wanted], device), seed)
+            request = FitRequest(make_budget(budget), chosen, seed)
             run = partial(fit_recording, capture / "clip", wanted, folder, request, TFP)
             found.append(Outcome(case, method, **_scored(run, folder, shown)))
             _write(out, found, about)
@@ -177,14 +179,14 @@ def _scored(fit: Callable[[], None], out: Path, truth: Scene) -> dict[str, Any]:
     return read_json(kept, "the scores of a fit")
 
 
-def _scores(folder: Path, truth: Scene) -> dict[str, float]:
-    """Return the mean scores over all targets; over those with a moving region for `psnr_dynamic`."""
+def _scores(folder: Path, truth: Scene) -> dict[str, float | None]:
+    """Return the mean scores over all targets; for `psnr_dynamic` over those with a moving region, None without any."""
     predictions = open_predictions(folder, truth.targets)
     images = [
         score_image(truth.ground_truth(t), predictions.read(t), truth.moving(t), metrics=METRICS) for t in truth.targets
     ]
     values = {m: [image[m] for image in images if m in image] for m in METRICS}
-    return {m: sum(v) / len(v) for m, v in values.items()}
+    return {m: sum(v) / len(v) if v else None for m, v in values.items()}
 
 
 def _write(out: Path, found: Sequence[Outcome], about: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """The docs say what is true: links resolve, named places exist, every page is in the site, the README is short."""
 
 import ast
+import importlib.util
 import re
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 from spike4dgs.benchmark.method import FitRequest, check_protocol
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -51,6 +53,18 @@ def anchors(path: Path) -> set[str]:
     """The anchors of a page's headings, as GitHub and MkDocs make them."""
     titles = re.findall(r"^#+ (.+)$", _FENCE.sub("", path.read_text()), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("figure", ["conditions", "uncalibrated"])
+def test_figures_are_drawn_from_the_records(figure: str, tmp_path: Path) -> None:
+    """The script is no part of the package, so nothing else imports it."""
+    spec = importlib.util.spec_from_file_location("result_figures", DOCS / "result_figures.py")
+    assert spec is not None and spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    script.FIGURES[figure](tmp_path / "figure.webp")
+    with Image.open(tmp_path / "figure.webp") as image:
+        assert image.format == "WEBP" and np.ptp(np.asarray(image.convert("L"))) > 200
 
 
 def test_the_readme_is_short() -> None:

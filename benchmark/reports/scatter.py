@@ -247,9 +247,11 @@ def log_ticks(low: float, high: float) -> list[float]:
     [40.0, 60.0, 80.0, 100.0, 120.0]
     >>> log_ticks(0.8, 90)
     [1.0, 2.0, 5.0, 10.0, 20.0, 50.0]
+    >>> log_ticks(0.8, 900)
+    [1.0, 5.0, 10.0, 50.0, 100.0, 500.0]
     """
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    for steps in ((1, 2, 5), (1,)):
+    for steps in ((1, 2, 5), (1, 5), (1,)):
         found = [s * 10.0**e for e in decades for s in steps if low <= s * 10.0**e <= high]
         if 4 <= len(found) <= 8:
             return found

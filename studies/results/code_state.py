@@ -12,10 +12,14 @@ from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import get_method
 from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
+from spike4dgs.leaderboard import truth_check
 from spike4dgs.method.recipes import METHODS as OURS
 from spike4dgs.method.tuned import is_tuned
+from spike4dgs.studies import images as studied_images
 from spike4dgs.studies.results.plan import CEILING
 from spike4dgs.studies.results.records import DIGITS
+from spike4dgs.studies.results.tables import ceilings
+from spike4dgs.studies.results.tables import images as image_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 # What decides about a number. Records, pages and tests may change while a sweep runs.
@@ -65,9 +69,10 @@ def check_clean(state: CodeState, allow_dirty: bool) -> None:
 def code_digest(row: str) -> str:
     """Return a digest of the sources that a row's method and its scores come from, and of searched settings."""
     if row == CEILING:
-        return sources_sha256([benchmark, generators])[:DIGITS]
+        return sources_sha256([benchmark, generators, truth_check, ceilings])[:DIGITS]
     row = row.removesuffix(REFINED).partition("[")[0]  # its name has its settings
-    found = sources_sha256([benchmark, method, *([] if row in OURS else [baselines])])
+    scoring = [studied_images, image_rows] if row.endswith(image_rows.SUFFIX) else []
+    found = sources_sha256([benchmark, method, *([] if row in OURS else [baselines]), *scoring])
     if is_tuned(row):
         found = sha256_json([found, get_method(row).params["settings"]])
     return found[:DIGITS]

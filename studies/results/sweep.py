@@ -60,6 +60,10 @@ class SweepSettings:
     limit_hours: float | None = None
     quiet: bool = False
 
+    def is_over(self, start: float) -> bool:
+        """Return whether the hours of a sweep that began at `start` (monotonic) are over."""
+        return self.limit_hours is not None and time.monotonic() - start > 3600 * self.limit_hours
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -94,13 +98,16 @@ def sweep(
         console.print(f"{len(cells)} cells planned, {len(here) - len(todo)} measured, {len(todo)} to measure")
         codes = {name: code_digest(name) for name in dict.fromkeys(cell.row for cell in here)}
         _say_other_code(here, records, codes, console)
-        kept = _Kept(scenes, revisions, codes, state, settings, records)
-        for cell in todo:
-            if cell.row.endswith(IMAGES):
-                kept.keep(cell, measure_images(cell.row, scenes[_place(cell)]))
-            elif cell.row == CEILING:
-                kept.keep(cell, measure_ceiling(scenes[_place(cell)]))
-        _measure([cell for cell in todo if not _needs_no_fit(cell.row)], methods, kept, console)
+        kept, start = _Kept(scenes, revisions, codes, state, settings, records), time.monotonic()
+        for cell in (cell for cell in todo if _needs_no_fit(cell.row)):
+            scene = scenes[_place(cell)]
+            kept.keep(cell, measure_ceiling(scene) if cell.row == CEILING else measure_images(cell.row, scene))
+            if settings.is_over(start):
+                break
+        else:
+            _measure([cell for cell in todo if not _needs_no_fit(cell.row)], methods, kept, start, console)
+        if settings.is_over(start):
+            console.print(f"--limit-hours {settings.limit_hours:g}: no further cell is begun")
         failed = [r for r in map(records.get, map(_key, here)) if r and (r["error"] or "").startswith(FAILED)]
         left = sum(_key(cell) not in records for cell in cells)
         return Outcome(left, tuple(f"{r['row']} on {r['scene']}, seed {r['seed']}: {r['error']}" for r in failed))
@@ -188,8 +195,8 @@ class _Kept:
         write_row(self.settings.records, cell.row, self.records.values())
 
 
-def _measure(todo: Sequence[Cell], methods: Mapping[str, Method], kept: _Kept, console: Console) -> None:
-    """Fit and score the cells, and keep each at once."""
+def _measure(todo: Sequence[Cell], methods: Mapping[str, Method], kept: _Kept, start: float, console: Console) -> None:
+    """Fit and score the cells, and keep each at once, until the hours that began at `start` are over."""
     settings = kept.settings
     jobs = [
         JobFiles(
@@ -207,7 +214,7 @@ def _measure(todo: Sequence[Cell], methods: Mapping[str, Method], kept: _Kept, c
         )
         for cell in todo
     ]
-    start, selection = time.monotonic(), select_metrics().among(METRICS)
+    selection = select_metrics().among(METRICS)
     shared = Settings(settings.out, workers=settings.workers)
     with RunDisplay(console, len(jobs), [cell.row for cell in todo], typical_fit_seconds()) as display:
         for k, scored in run_cells(jobs, shared, selection, display):
@@ -220,6 +227,5 @@ def _measure(todo: Sequence[Cell], methods: Mapping[str, Method], kept: _Kept, c
                     **scores_of(scored[-1 if job.refined else 0]),
                 },
             )
-            if settings.limit_hours is not None and time.monotonic() - start > 3600 * settings.limit_hours:
-                display.say(f"--limit-hours {settings.limit_hours:g}: no further cell is begun")
+            if settings.is_over(start):
                 return

@@ -14,6 +14,7 @@ from typing import Any
 from spike4dgs.method.settings import Settings, SettingsByPart
 
 STEPS_OF_TWO = 1.6  # steps of two views in the time of one step of four (200x125 pixels, two cores)
+_SHARES = 0.1, 0.5  # of the static stage
 _CUSTOMARY, _BOX = "0.3 px^2", "1/12 px^2, compensated"
 Values = Mapping[str, Any]  # by knob, or by PART.NAME
 Parts = Mapping[str, Any]  # the settings of a recipe by part
@@ -110,6 +111,11 @@ def _static_share(settings: Parts) -> float:
     return float(trainer.coarse_steps / (trainer.coarse_steps + trainer.fine_steps))
 
 
+def _has_static_share(settings: Parts) -> bool:
+    """Return whether a recipe splits its steps as a search may: one that stands still has a stage of them alone."""
+    return _has("trainer", "coarse_steps")(settings) and _SHARES[0] <= _static_share(settings) <= _SHARES[1]
+
+
 def _tracked_times(values: Values, settings: Parts) -> dict[str, Any]:
     """Return the spacing of times that are tracked one by one, and as many steps in all as before."""
     later = round(settings["motion"].later_steps * values["times"] / settings["images"].time_spacing_ticks)
@@ -126,7 +132,7 @@ KNOBS = (
         _filter,
         (_CUSTOMARY, _BOX),
     ),
-    Knob("static_share", _has("trainer", "coarse_steps"), _static_share, _steps, low=0.1, high=0.5),
+    Knob("static_share", _has_static_share, _static_share, _steps, low=_SHARES[0], high=_SHARES[1]),
     _choice("last_rate", "trainer", "lr_last", 1.0, 0.3, 0.1),
     _choice("first_scale", "trainer", "initial_scale", 0.5, 0.7, 1.0),
     _choice("views_per_step", "trainer", "views_per_step", 2, 4),

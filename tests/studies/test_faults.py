@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from changes import edit_json, files_in
 from skimage.metrics import peak_signal_noise_ratio
+from small_scenes import HEIGHT, WIDTH
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.predictions import open_predictions
+from spike4dgs.benchmark.scene.images import write_exr, write_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
@@ -125,6 +127,17 @@ def test_rows_of_the_lens_show_the_scene_that_was_made_with_it(
     # The streams are those of the same pinholes: a fit that is told of no lens has the same score.
     assert (ignored["fault"], ignored["size"]) == ("lens", "ignored")
     assert float(ignored["psnr"]) == pytest.approx(float(exact["psnr"]), abs=1e-3)
+
+
+def test_a_scene_in_which_nothing_moves_has_no_score_where_things_move(small_scene: Path, tmp_path: Path) -> None:
+    for mask in small_scene.rglob("masks/*/*.png"):
+        write_mask(mask, np.zeros((HEIGHT, WIDTH), bool))
+    write_manifest(small_scene)
+    scene = open_scene(small_scene)
+    for target in scene.targets:
+        write_exr(tmp_path / f"{target.name}.exr", scene.ground_truth(target) + np.float32(0.1), 0)
+    found = fault_table._scores(tmp_path, scene)
+    assert found["psnr"] == pytest.approx(20, abs=0.1) and found["psnr_dynamic"] is None
 
 
 def test_a_fit_that_fails_has_a_dash_and_its_reason(tmp_path: Path) -> None:

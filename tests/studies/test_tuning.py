@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from spike4dgs.baselines import recipes as theirs
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import get_method
+from spike4dgs.benchmark.method import find_methods, get_method
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
 from spike4dgs.method import recipes as ours
@@ -35,6 +35,13 @@ def test_the_first_trial_is_the_recipe_as_it_is(name):
         override(method.settings, as_settings(start_of(method.settings), method.settings), "start") == method.settings
     )
     assert variant(method, start_of(method.settings)) is method
+
+
+def test_every_recipe_lies_in_the_space_of_its_search():
+    for name, method in find_methods().items():
+        for knob in knobs_of(getattr(method, "settings", {})):
+            start = knob.start(method.settings)
+            assert start in knob.choices if knob.choices else knob.low <= start <= knob.high, (name, knob.name)
 
 
 @pytest.mark.parametrize("name", ["tfp+stg", "spike4dgs", "spike4dgs-x", "tfi+4dgs"])

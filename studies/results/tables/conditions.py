@@ -135,7 +135,7 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
     heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names), _NOISE)
     legend = (
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
-        f"others its change; a prediction without error has the PSNR of the {_NOISE}."
+        f"others its change; a prediction without error has the PSNR of the {_NOISE}, measured at the middle target."
     )
     text = " ".join([legend_of(legend, lines), *_seeds(names, own)])
     return [*markdown(heads, lines), "", text, "", provenance(own, *EVERY)]

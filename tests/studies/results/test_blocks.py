@@ -271,7 +271,7 @@ def test_the_order_of_the_paper_stands_beside_ours_for_complete_rows_of_both():
         "| `tfp+d3dgs` | 31.00 | 33.00 | 20.36 | 3 / 3 | 0.9700 | 0.7688 | 1 / 3 |",
     ]
     assert lines[7].startswith(f"Kendall's tau with the published order: PSNR {(2 - 1) / 3:.2f}")
-    assert "15 of" in lines[9] or "20 of" in lines[9]
+    assert "20 of 50 planned cells" in lines[9], "of the rows that are shown, three of them with three seeds"
 
 
 def test_estimated_poses_stand_beside_given_ones_where_both_are_measured():
@@ -299,7 +299,9 @@ def test_table_5_has_a_column_for_each_number_of_views():
 def test_pairs_count_the_scenes_on_which_the_first_is_ahead():
     found = [record("tfp+stg", s, 30.0 + k) for k, s in enumerate(NINE.scenes)]
     found += [record("tfp+4dgs", s, 32.0 + 0.5 * k) for k, s in enumerate(NINE.scenes)]
-    assert pairs_block(found)[2] == "| `tfp+stg` | `tfp+4dgs` | +0.00 | 4 | +0.00 | 4 |"
+    lines = pairs_block(found)
+    assert lines[2] == "| `tfp+stg` | `tfp+4dgs` | +0.00 | 4 | +0.00 | 4 |"
+    assert "18 of 54 planned cells" in lines[-1], "of the rows that are shown"
 
 
 def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_worlds_are_measured():
@@ -317,6 +319,16 @@ def test_a_condition_has_its_own_scenes_and_shows_what_it_changes_where_both_wor
         "the blur has been measured in one world"
     )
     assert "6 of" in lines[-1]
+
+
+def test_a_change_between_two_codes_of_a_row_is_marked() -> None:
+    first, lens, _ = (condition.scenes for condition in CONDITIONS[:3])
+    before = [record(OURS, s, 30.0) for s in first]
+    line, legend = (conditions_block([*before, *(record(OURS, s, 29.0) for s in lens)])[k] for k in (3, 5))
+    assert "| -1.00 / -1.00 |" in line and "†" not in legend
+    other = [record(OURS, s, 29.0, code="00000000000c") for s in lens]
+    line, legend = (conditions_block([*before, *other])[k] for k in (3, 5))
+    assert "| -1.00 / -1.00 † |" in line and "†: the two were measured with different code" in legend
 
 
 def test_a_condition_that_was_made_in_one_world_is_compared_with_that_world():

@@ -35,7 +35,7 @@ def test_noise_of_a_known_size_in_the_truth_is_the_ceiling(tiny_data: Path, tmp_
     assert found["metrics"]["psnr_dynamic"] == pytest.approx(-10 * np.log10(squares[moving].mean()), abs=0.8)
 
 
-def test_a_ceilings_code_is_the_renderers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_of_ceilings_and_images_has_what_measures_them(monkeypatch: pytest.MonkeyPatch) -> None:
     hashed: list[list[str]] = []
 
     def note(packages: list[ModuleType]) -> str:
@@ -43,9 +43,11 @@ def test_a_ceilings_code_is_the_renderers(monkeypatch: pytest.MonkeyPatch) -> No
         return "0" * 64
 
     monkeypatch.setattr(code_state, "sources_sha256", note)
-    for row in (CEILING, "tfp+stg"):
+    for row in (CEILING, "tfp+stg", "tfp+rig-flat.images"):
         code_state.code_digest(row)
-    ceiling, baseline = hashed
+    ceiling, baseline, image = hashed
+    assert "spike4dgs.leaderboard.truth_check" in ceiling
+    assert set(image) - set(baseline) == {"spike4dgs.studies.images", "spike4dgs.studies.results.tables.images"}
     assert "spike4dgs.generators" in ceiling and "spike4dgs.baselines" not in ceiling
     assert "spike4dgs.baselines" in baseline and "spike4dgs.generators" not in baseline
 

@@ -182,6 +182,8 @@ def test_a_limit_of_time_begins_no_further_cell_and_scenes_may_be_missing(folder
     outcome, records, said = swept(folder, planned, methods, limit_hours=0.0)
     assert [key[0] for key in records] == ["a"] and outcome.left == 3
     assert "left out: pattern-1" in said and "no further cell" in said
+    outcome, records, said = swept(folder, cells("tfp.images", "tfi.images", "a"), methods, limit_hours=0.0)
+    assert [key[0] for key in records if key[0].endswith(".images")] == ["tfp.images"] and "no further cell" in said
     with pytest.raises(UserError, match="expected scenes of the plan, such as pattern-7, found none"):
         swept(folder, cells("a", scenes=("pattern-7",)), methods)
 
