@@ -73,6 +73,15 @@ def sixteen_bits(folder: Path) -> None:
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16)).save(folder / "cam_1/img_0.png")
 
 
+def sixteen_bits_of_colour(folder: Path) -> None:
+    cv2.imwrite(str(folder / "cam_1/img_0.png"), np.full((HEIGHT, WIDTH, 3), 300, np.uint16))
+
+
+def sixteen_bits_of_colour_in_a_tiff(folder: Path) -> None:
+    (folder / "cam_1/img_0.png").unlink()
+    cv2.imwrite(str(folder / "cam_1/img_0.tiff"), np.full((HEIGHT, WIDTH, 3), 300, np.uint16))
+
+
 def twice(folder: Path) -> None:
     (folder / "cam_1.mp4").write_bytes(b"no video")
 
@@ -97,6 +106,8 @@ def nothing(folder: Path) -> None:
         (other_size, "one size for all cameras"),
         (other_length, "the same number of frames"),
         (sixteen_bits, "8 bits a channel"),
+        (sixteen_bits_of_colour, "8 bits a channel, found mode RGB, of more bits"),
+        (sixteen_bits_of_colour_in_a_tiff, "8 bits a channel, found mode RGB, of more bits"),
         (twice, "a video"),
         (bad_video, "a video"),
         (odd_name, "the id of a camera"),
