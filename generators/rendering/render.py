@@ -211,10 +211,10 @@ class MultiViewRenderer(Visibility):
 
         self._scene.set_time(t_s)
         integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
-        frames = []
+        seed, frames = (self._seed + 1) % (1 << 32), []  # Mitsuba takes 32 bits
         for camera in self.cameras:
             sensor = load_sensor(camera, {"type": "hdrfilm", "width": camera.width, "height": camera.height}, spp)
-            rgb = np.array(mi.render(self._scene.full, sensor=sensor, integrator=integrator, seed=self._seed + 1))
+            rgb = np.array(mi.render(self._scene.full, sensor=sensor, integrator=integrator, seed=seed))
             frames.append(rgb[..., :3] if self.color else gray(rgb[..., :3]))
         return np.stack(frames) * np.float32(self.world.exposure)
 

@@ -60,13 +60,13 @@ class PixelSampler(mi.Sampler):  # type: ignore[misc]
         self.dimension = dr.zeros(mi.UInt32, dr.width(key))
 
     def next_1d(self, active: mi.Bool = True) -> mi.Float:
-        """Return one stratified number in [0, 1) per lane."""
+        """Return one stratified number per lane, in [0, 1); seldom it rounds to 1."""
         salt = self._next_salt()
         stratum = _shuffle(self.index, self._count, salt)
         return (mi.Float(stratum) + _unit(_hash(salt ^ (self.index * 0x68E31DA4)))) * self._share
 
     def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
-        """Return one point per lane, stratified on the grid and along both axes."""
+        """Return one point per lane, stratified on the grid and along both axes; a coordinate may round to 1."""
         salt = self._next_salt()
         s = _shuffle(self.index, self._count, salt)
         column, row = s & (self._columns - 1), s >> self._across
@@ -129,7 +129,7 @@ class Views:
     keys: mi.UInt32  # [C + 1] numbers of the cameras, and 0: one number alone would be another kernel's
     cameras: mi.Float  # [C * 12] matrices from pixel coordinates to directions, and centres
     lenses: mi.Float | None  # [C * 9] fx, fy, cx, cy, and the distortion
-    footprint: mi.Float | None  # quantiles of a blurred pixel
+    footprint: mi.Float | None  # quantiles of a blurred pixel, the last one twice: it is read at 1
 
     @staticmethod
     def of(cameras: Sequence[Camera], psf_px: float) -> Views:
@@ -143,7 +143,9 @@ class Views:
             mi.UInt32(aligned(np.array([*(zlib.crc32(c.id.encode()) for c in cameras), 0], np.uint32))),
             mi.Float(aligned(np.array(rows, np.float32).ravel())),
             mi.Float(aligned(np.array(lenses, np.float32).ravel())) if has_lens else None,
-            mi.Float(aligned(footprint_quantiles(psf_px).astype(np.float32))) if psf_px else None,
+            mi.Float(aligned(np.pad(footprint_quantiles(psf_px), (0, 1), "edge").astype(np.float32)))
+            if psf_px
+            else None,
         )
 
     def samples(self, launch: Samples, centre: bool = False) -> tuple[mi.UInt32, PixelSampler, mi.RayDifferential3f]:
@@ -164,7 +166,7 @@ class Views:
         return view, sampler, self._ray(view, mi.Float(column) + offset.x, mi.Float(row) + offset.y)
 
     def _blurred(self, u: mi.Float) -> mi.Float:
-        """Return the place in a blurred pixel, px from its left or upper edge, of numbers in [0, 1): one each way."""
+        """Return the place in a blurred pixel, px from its left or upper edge, of numbers in [0, 1]: one each way."""
         at = u * _QUANTILES
         first = mi.UInt32(at)
         low, high = (dr.gather(mi.Float, self.footprint, first + k) for k in (0, 1))

@@ -205,6 +205,12 @@ def test_cameras_of_two_sizes_are_refused():
         MultiViewRenderer(world("car"), both, seed=0, spp=16, background_spp=16)
 
 
+@one_world
+def test_a_reference_takes_any_seed(r, monkeypatch):
+    monkeypatch.setattr(r, "_seed", 2**100)
+    assert np.isfinite(r.reference_frames(T_S, 1)).all()
+
+
 @pytest.mark.parametrize("sigma", [0.2, 0.5, 0.8])
 def test_a_blurred_pixels_footprint_is_a_box_and_a_gaussian(sigma):
     if load_mitsuba().variant().startswith("scalar"):
@@ -218,6 +224,17 @@ def test_a_blurred_pixels_footprint_is_a_box_and_a_gaussian(sigma):
     inside = np.random.default_rng(0).uniform(-0.5, 0.5, 400_000)
     for edge in (-0.7, 0.0, 0.4, 1.1):  # the response to an edge, by another way
         assert np.mean(middle < edge) == pytest.approx(norm.cdf((edge - inside) / sigma).mean(), abs=2e-3)
+
+
+def test_a_blur_of_a_number_that_rounded_to_one_is_the_last_quantile():
+    if load_mitsuba().variant().startswith("scalar"):
+        pytest.skip("the scalar variant has no blur")
+    import mitsuba as mi
+
+    from spike4dgs.generators.rendering.wavefront import Views, footprint_quantiles
+
+    views = Views.of(cameras(world("car"), 8, 5, (4,)), 0.5)
+    assert np.array(views._blurred(mi.Float(1.0)))[0] == pytest.approx(0.5 + footprint_quantiles(0.5)[-1])
 
 
 def test_a_blur_is_that_of_the_radiance_and_keeps_its_sum():
