@@ -159,11 +159,14 @@ def images_of(scene: Scene, camera: str) -> list[Target]:
 
 
 def truth_error(a: Scene, b: Scene, target: Target) -> Float64 | None:
-    """Return the difference of two truths [H, W], clipped to [0, 1] as for a score; None if `b` lacks the image."""
+    """Return the difference of two truths [H, W], clipped to [0, 1] as for a score.
+
+    None if `b` lacks the image, or has it in another size.
+    """
     if f"images/{target.name}.exr" not in b.manifest.files:
         return None
     first, second = (np.clip(scene.ground_truth(target).astype(np.float64), 0, 1) for scene in (a, b))
-    return np.asarray(first - second)
+    return np.asarray(first - second) if first.shape == second.shape else None
 
 
 def bits_that_differ(a: SpikeStream, b: SpikeStream) -> float:

@@ -277,6 +277,17 @@ def test_what_noise_does_not_explain_is_a_change(
     assert any(reason in line for line in found["reasons"]), found["reasons"]
 
 
+def test_a_reference_of_another_size_is_a_change(scenes: tuple[Path, Path]) -> None:
+    out, references = scenes
+    shutil.rmtree(references / JOB.id)
+    wide = write_small_scene(references / JOB.id, width=2 * WIDTH)
+    change(wide, edit("scene.json", lambda m: m.update(id=JOB.id)))
+    code, found = check(out, references)
+    assert (code, found["verdict"], found["cameras"]) == (1, "change of the world", {})
+    assert any("width" in line for line in found["reasons"]), found["reasons"]
+    assert not (out / "check.png").exists()
+
+
 def test_facts_that_differ_by_rounding_are_the_same(scenes: tuple[Path, Path]) -> None:
     out, references = scenes
 
