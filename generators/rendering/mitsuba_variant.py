@@ -119,13 +119,18 @@ def load_mitsuba() -> ModuleType:
 
 
 def _cached_probe() -> str:
-    """Return why the fast variant fails ("" if it works), from the cache file or from a new probe."""
+    """Return why the fast variant fails ("" if it works), from the cache file or from a new probe.
+
+    An answer that may be due to a moment's load or lack of memory is not kept.
+    """
     path = user_cache() / f"mitsuba-{_fingerprint()}.json"
     try:
         return str(json.loads(path.read_text())["why_not"])
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    why_not = _probe()
+    why_not, passing = _probe()
+    if passing:
+        return why_not
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = path.with_suffix(f".{os.getpid()}.tmp")
@@ -136,18 +141,22 @@ def _cached_probe() -> str:
     return why_not
 
 
-def _probe(timeout_s: float = 180.0) -> str:
-    """Render a small image in a child process; return "" or one line that says what went wrong."""
+def _probe(timeout_s: float = 180.0) -> tuple[str, bool]:
+    """Render a small image in a child process.
+
+    Return "" or one line that says what went wrong, and whether it may go right another time.
+    """
     try:
         child = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=timeout_s)
     except subprocess.TimeoutExpired:
-        return f"no answer within {timeout_s:.0f} s"
+        return f"no answer within {timeout_s:.0f} s", True
     if child.returncode == 0 and "works" in child.stdout:
-        return ""
+        return "", False
     complaint = [line.strip() for line in child.stderr.splitlines() if line.strip()]
     if child.returncode < 0:
-        return f"killed by {signal.Signals(-child.returncode).name}" + (f", {complaint[0]}" if complaint else "")
-    return complaint[-1] if complaint else f"exit code {child.returncode}"
+        why_not = f"killed by {signal.Signals(-child.returncode).name}" + (f", {complaint[0]}" if complaint else "")
+        return why_not, child.returncode == -signal.SIGKILL  # as the system does where memory is short
+    return complaint[-1] if complaint else f"exit code {child.returncode}", False
 
 
 def _fingerprint() -> str:

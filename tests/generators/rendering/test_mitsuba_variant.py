@@ -56,6 +56,24 @@ def test_a_libllvm_that_does_not_load_means_the_scalar_variant_and_one_line(tmp_
     assert python(_PICK, **environment).stdout.strip() == SAFE
 
 
+@pytest.mark.parametrize(
+    ("body", "timeout_s", "expected"),
+    [("kill -9 $$", 60.0, "killed by SIGKILL"), ("exec sleep 60", 0.1, "no answer")],
+)
+def test_a_failure_that_may_pass_is_not_remembered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str, timeout_s: float, expected: str
+):
+    child, run = tmp_path / "python", subprocess.run
+    child.write_text(f"#!/bin/sh\n{body}\n")
+    child.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(child))
+    monkeypatch.setattr(subprocess, "run", lambda *args, **options: run(*args, **options | {"timeout": timeout_s}))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(OVERRIDE, raising=False)
+    assert mitsuba_variant.diagnose().why_not_fast.startswith(expected)
+    assert not list(tmp_path.glob("spike4dgs/mitsuba-*"))
+
+
 def test_asking_for_llvm_without_libllvm_is_one_clear_error(tmp_path: Path):
     bogus = tmp_path / "libLLVM.so"
     bogus.write_bytes(b"not a library")
