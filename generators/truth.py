@@ -240,8 +240,8 @@ def errors(image: NDArray[np.float32], truth: NDArray[np.float32], moving: NDArr
 
 
 def _total(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Return the means over the rows."""
-    keys = [k for k in rows[0] if isinstance(rows[0][k], float)]
+    """Return the means over the rows that have a value: where nothing moves there is none of motion."""
+    keys = dict.fromkeys(k for r in rows for k, v in r.items() if isinstance(v, float))
     return {k: round(float(np.mean([r[k] for r in rows if k in r])), 5) for k in keys}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spike4dgs.generators.truth import errors, moving_region
+from spike4dgs.generators.truth import _total, errors, moving_region
 
 
 def test_moving_region_has_the_object_and_its_moving_shadow_only():
@@ -35,3 +35,8 @@ def test_audit_errors_against_closed_forms():
     )
     assert found["mean_absolute"] == pytest.approx(0.025, abs=1e-4)
     assert "psnr_db_moving" not in errors(image, truth, np.zeros((10, 10), bool))
+
+
+def test_totals_are_over_the_images_with_a_value():
+    rows = [{"tick": 1, "psnr_db": 40.0}, {"tick": 2, "psnr_db": 30.0, "psnr_db_moving": 20.0}]
+    assert _total(rows) == {"psnr_db": 35.0, "psnr_db_moving": 20.0}
