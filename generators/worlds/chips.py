@@ -16,6 +16,7 @@ from spike4dgs.generators.worlds.textures import Canvas, fractal, mix, plain
 RADIUS_M, THICK_M = 0.024, 0.0045
 _SEGMENTS = 28
 _BEFORE_S = 0.05  # of simulated fall before the middle of the clip
+_SLOWEST_M_S = 0.3  # of fall when it begins
 _FLOOR_M = -0.01
 _CELL = 112  # texels of a chip's face
 _COLOURS: tuple[Colour, ...] = (
@@ -35,7 +36,7 @@ class _Throw:
     """The random choices of a variant; the defaults are those of variant 0."""
 
     count: int = 48
-    speed_m_s: float = 2.6  # of fall in the middle of the clip
+    speed_m_s: float = 2.6  # of fall in the middle of the clip, at least
     drift_m_s: float = 0.5
     felt: Colour = (0.045, 0.22, 0.10)
     lamp: Lamp = Lamp((0.70, -0.70, 1.6), 0.95)
@@ -56,7 +57,8 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     throw = _sample(variant, rng)
     start_s = min(0.0, duration_s / 2 - _BEFORE_S)
     blocks = [Block.around(mesh) for mesh in _edges()]
-    path = simulate(_bodies(throw, duration_s / 2 - start_s, rng), start_s, duration_s, friction=0.3, blocks=blocks)
+    fall_s = duration_s / 2 - start_s
+    path = simulate(_bodies(throw, fall_s, rng), start_s, duration_s, friction=0.3, blocks=blocks)
     chips = [_chip(int(kind)) for kind in rng.integers(0, len(_COLOURS), throw.count)]
     mesh, (owner, bodies) = merge(chips), owners(chips)
     surface = Part(mesh, Material(_image(rng), 0.3))
@@ -76,7 +78,11 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         ),
         shadow_sources=throw.lamp.points,
         depth_range=(0.2, 4.0),
-        notes={"speed_m_s": throw.speed_m_s, "length_m": 2 * RADIUS_M, "chips": float(throw.count)},
+        notes={
+            "speed_m_s": max(throw.speed_m_s, _SLOWEST_M_S + GRAVITY_M_S2 * fall_s),
+            "length_m": 2 * RADIUS_M,
+            "chips": float(throw.count),
+        },
         deforming={"chip": Deforming(surface, lambda t_s: path.vertices(t_s, mesh.vertices, owner), bodies)},
     )
 
@@ -92,7 +98,7 @@ def _bodies(throw: _Throw, fall_s: float, rng: np.random.Generator) -> list[Body
     bodies: list[Body] = []
     while len(bodies) < throw.count:
         position = np.array([rng.normal(0, 0.10), rng.normal(0.02, 0.07), rng.uniform(0.01, 0.34)])
-        down = max(speed + rng.uniform(-0.3, 0.3), 0.3)
+        down = max(speed + rng.uniform(-0.3, 0.3), _SLOWEST_M_S)
         velocity = np.array([throw.drift_m_s + rng.normal(0, 0.25), rng.normal(0, 0.25), -down])
         begin = position - velocity * fall_s + [0, 0, GRAVITY_M_S2 / 2 * fall_s**2]
         ends = np.stack([begin, position])

@@ -300,7 +300,7 @@ def test_most_chips_are_in_the_air_in_the_middle_of_the_clip(variant, duration_s
     assert (low > 0.01).mean() > 0.75 and (low < 0.03).any() and np.std(low) > 0.06
     k = round((duration_s / 2 - path.start_s) / STEP_S)
     fall = -np.diff(path.positions, axis=0)[k, low > 0.1, 2] / STEP_S
-    assert np.median(fall) == pytest.approx(world.notes["speed_m_s"], rel=0.15)
+    assert np.median(fall) == pytest.approx(world.notes["speed_m_s"], rel=0.06)
     apart = np.linalg.norm(path.positions[0][:, None] - path.positions[0][None], axis=-1)
     assert apart[np.triu_indices(len(bodies), 1)].min() > 2 * np.hypot(chips.RADIUS_M, chips.THICK_M / 2)
 
