@@ -12,7 +12,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
@@ -291,5 +291,5 @@ def _alone(path: Path) -> Iterator[None]:
     with locked(path, path.stem, "a scene that nobody else makes"):
         yield
     path.unlink(missing_ok=True)
-    if not any(path.parent.iterdir()):
+    with suppress(OSError):  # another process still has files there, or was the last
         path.parent.rmdir()

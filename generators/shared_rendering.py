@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ class SharingMaker(Maker):
     def forget(self) -> None:
         """Remove what scenes of this rendering share."""
         shutil.rmtree(self._shared, ignore_errors=True)
-        if not any(self._shared.parent.iterdir()):
+        with suppress(OSError):  # another process still has files there, or was the last
             self._shared.parent.rmdir()
 
     @property

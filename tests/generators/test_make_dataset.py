@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +23,7 @@ from spike4dgs.generators.make_dataset import SceneSettings, make_dataset, track
 from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.profiles import PROFILES, TRACKS, Job
 from spike4dgs.generators.scene_maker import Maker
+from spike4dgs.generators.shared_rendering import SharingMaker
 from spike4dgs.generators.worlds import HARD, OURS
 
 JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
@@ -222,6 +224,17 @@ def test_two_processes_do_not_make_one_scene(fake, tmp_path):
     with locked(tmp_path / ".work/car-0-tiny.lock", "x", "free"), pytest.raises(UserError, match=message):
         make("car", out=tmp_path)
     assert not (tmp_path / "car-0-tiny").exists()
+
+
+def test_the_last_of_several_processes_may_have_tidied_up(fake, tmp_path):
+    lock = tmp_path / ".work/car-0-tiny.lock"
+    with scene_maker._alone(lock):
+        shutil.rmtree(lock.parent)
+    SharingMaker(JOB, tmp_path, plain).forget()
+    with scene_maker._alone(lock):
+        (lock.parent / "van-0-tiny.lock").touch()
+    SharingMaker(JOB, tmp_path, plain).forget()
+    assert [path.name for path in lock.parent.iterdir()] == ["van-0-tiny.lock"]
 
 
 def test_a_complete_scene_is_kept_checked_or_refused(fake, tmp_path, capsys):
