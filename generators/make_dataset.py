@@ -50,7 +50,7 @@ class SceneSettings:
         shot_noise: Simulate the random arrival of photons.
         adaptive_keys: Render each pixel as often as its motion requires, not every changing pixel at every tick (slow).
         sub_ticks: Render instants inside a tick where the motion in one tick is too large.
-        whole_frames: Trace every pixel of every key, not only the region that changes (slow, and noisier).
+        whole_frames: Trace every pixel of each coarse key, not only the region that changes (slow, and noisier).
         rendering: paths traces whole paths (release 1); split traces direct light and takes soft light from smoothed
             maps: a tenth of the noise, denser keys. It needs Mitsuba's LLVM or CUDA variant.
         physics: What differs from ideal cameras and lamps.

@@ -179,7 +179,7 @@ class Job:
     shot_noise: bool = True
     adaptive: bool = True  # False: every pixel that changes, at every tick
     sub_ticks: bool = True  # False: never render instants inside a tick
-    whole_frames: bool = False  # True: every pixel of every key
+    whole_frames: bool = False  # True: every pixel of every coarse key
     physics: Physics = Physics()
     noise: int = 0  # another number gives the rendering other noise, and changes nothing else
 

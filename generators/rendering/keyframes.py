@@ -42,7 +42,7 @@ class KeyStore:
     For example::
 
         store = KeyStore(Path("keys"))
-        store.set_static(renderer.static())
+        store.set_static(renderer.static)
         for tick in store.missing(plan):
             store.put(tick, renderer.key_arrays(tick, plan))
         clip = store.view(0, plan)

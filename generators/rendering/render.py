@@ -122,7 +122,7 @@ class MultiViewRenderer(Visibility):
             background_spp: samples per pixel of the static background, a power of two, at least `spp`.
             color: images are linear RGB, [C, H, W, 3].
             static: `static` of a renderer with the same arguments; if None, it is rendered when needed.
-            whole_frames: trace every pixel of every key: slow and exact.
+            whole_frames: trace every pixel of coarse keys, slow and exact; finer ones, of objects and shadows alone.
             psf_px: standard deviation of the optics' blur, a Gaussian, before the pixel's box; 0 is off.
         """
         for name, value in (("spp", spp), ("background_spp", background_spp)):

@@ -132,9 +132,10 @@ class MovingArrayRenderer:
         return depth, numbers, flow.astype(np.float32)
 
     def speeds(self, t_s: float) -> np.ndarray:
-        """Return float32 [C, H, W], px/s: no visible point or shadow within 3 px is faster in the image.
+        """Return float32 [C, H, W], px/s: by how fast the images of points and shadows move, at most, at a pixel.
 
-        The sum of its own speed and of that of the point behind it, which the array moves.
+        The sum of the fastest motion in the world within 3 px and of what the array's motion makes of the pixel's own
+        point, not of its neighbours'.
         """
         now, later = self._at(t_s), self.path.posed(self.cameras, t_s + _STEP_S)
         carried = np.linalg.norm(now.flow(t_s, 0.0, later), axis=-1) / _STEP_S

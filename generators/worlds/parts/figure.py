@@ -40,7 +40,7 @@ class Clothes:
 
 @dataclass(frozen=True)
 class Joints:
-    """Positions [3] of the joints, in the middle or by side; `heading`: the direction that the chest faces."""
+    """Positions [3] of the joints, in the middle or by side."""
 
     hip: np.ndarray  # between the legs' joints
     neck: np.ndarray
