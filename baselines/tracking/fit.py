@@ -141,18 +141,16 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
         tracker.restore(saved)
     with one_torch_thread():
         tracker.run(checkpoint_s)
-    return TrackedModel(gaussians, tracker.tracks, job.scene.duration_us, tuple(job.start.cameras))
+    tracks, duration_us = tracker.tracks, job.scene.duration_us
+    if job.light:
+        tracks = tracks.lit(gaussians, job.light.factors, duration_us)
+    return TrackedModel(gaussians, tracks, duration_us, tuple(job.start.cameras))
 
 
 def first_index(job: FitJob) -> int:
     """Return the index of the time that everything starts from."""
     last = len(job.training_images.ticks) - 1
     return min(max(round(job.settings["motion"].start * last), 0), last)
-
-
-def later_total(job: FitJob) -> int:
-    """Return the steps of all further times."""
-    return sum(step_count(job.settings["motion"], v) for v in visits(first_index(job), len(job.training_images.ticks)))
 
 
 def step_count(settings: TrackingSettings, visit: Visit) -> int:
@@ -169,7 +167,7 @@ def fit_first(job: FitJob) -> Gaussians:
     start = from_points(job.start.points, job.start.values, opacity=settings.initial_opacity, device=request.device)
     scale = job.extent.scale
     trainer = Trainer(images.at(i), start, motion, loss, settings, DensitySettings(), scale=scale, seed=request.seed)
-    total = s.first_steps + later_total(job)
+    total = s.first_steps + sum(step_count(s, visit) for visit in visits(i, len(images.ticks)))
     trainer.run(lambda done, _, note="": request.progress(done, total, note))
     return trainer.gaussians.detached()
 

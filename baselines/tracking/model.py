@@ -9,12 +9,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.fitted_model import GaussianModel, count_bytes
 from spike4dgs.method.models.model_file import ModelFile, group, write_model
 from spike4dgs.method.splat import Splats
+from spike4dgs.method.training_views.light_layers import factor_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,17 @@ class Tracks:
         """Set the values at one of the times."""
         self.means[index], self.colors[index] = values["means"], values["colors"]
         self.quats[index] = torch.nn.functional.normalize(values["quats"], dim=-1)
+
+    def lit(self, gaussians: Gaussians, factors: Float64, duration_us: float) -> Tracks:
+        """Return tracks in changing light, of those in its mean: the colours of all Gaussians change with the light.
+
+        `factors` [n] are those of all light over equal parts of the clip.
+        """
+        light = [factor_at(factors, t_us / duration_us) for t_us in self.times_us.tolist()]
+        colors = gaussians.colors.repeat(len(light), 1, 1)
+        colors[:, self.rows] = self.colors
+        colors *= colors.new_tensor(light)[:, None, None]
+        return replace(self, rows=torch.arange(len(gaussians), device=colors.device), colors=colors)
 
     def between(self, t_us: float) -> dict[str, Tensor]:
         """Return values at any time: positions and rotations linear between and beyond the times, colours between them.

@@ -27,11 +27,13 @@ from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import FitJob
 from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.images.light import Light
 from spike4dgs.method.settings import override
 from spike4dgs.method.splat import Views
 from spike4dgs.method.starts.base import Start, measure
 from spike4dgs.method.supervision.pixel import PixelSettings
 from spike4dgs.method.training_views.foreground import foreground_masks
+from spike4dgs.method.training_views.light_layers import factor_at
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.25)
@@ -206,6 +208,17 @@ def test_a_scene_in_which_nothing_moves_is_one_image(tmp_path: Path) -> None:
     model = fit_tracking(job(tmp_path / "fit.safetensors", static=True, **TINY))
     images = [model.render(WORLD.held_out, t) for t in (0.0, 6000.0, 12000.0)]
     assert len(model.tracks.free) == 0 and np.array_equal(images[0], images[1]) and np.array_equal(images[1], images[2])
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_a_fit_in_mean_light_renders_the_light_of_its_instant(static: bool) -> None:
+    """Of the background too, which nothing tracks."""
+    j = job(**TINY, static=static)
+    light = Light(1 + 0.3 * np.sin(2 * np.pi * np.arange(WORLD.n_ticks) / WORLD.n_ticks))
+    mean, lit = fit_tracking(j), fit_tracking(replace(j, light=light))
+    for t_us in mean.tracks.times_us.tolist():
+        image = mean.render(WORLD.held_out, t_us) * factor_at(light.factors, t_us / mean.duration_us)
+        np.testing.assert_allclose(lit.render(WORLD.held_out, t_us), image, atol=1e-5)
 
 
 def tracks() -> Tracks:
