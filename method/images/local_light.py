@@ -43,8 +43,7 @@ def light_of(scene: TrainingScene, by_parts: bool) -> Light | None:
     light = estimate_light(scene.streams, clocks)
     if light is None:
         return None
-    if by_parts and light.local:
-        light = lamp(scene.streams, clocks, light)
+    if by_parts and light.local and (light := lamp(scene.streams, clocks, light)).local:
         print("the light of a part of the scene changes: fitted with a share for each Gaussian", file=sys.stderr)
         return light
     spread = 100 * float(np.std(light.factors))
@@ -53,8 +52,12 @@ def light_of(scene: TrainingScene, by_parts: bool) -> Light | None:
 
 
 def lamp(streams: Sequence[SpikeStream], clocks: Sequence[Clock], light: Light) -> Light:
-    """Return the course of a lamp from streams, each with its camera's clock, and a course that is like it."""
-    n_ticks = len(light.factors)
+    """Return the course of a lamp from streams, each with its camera's clock, and a course that is like it.
+
+    Where no pixel's spikes are even enough to tell it, as with much shot noise, that course is all that is known of the
+    light, and is returned as the whole scene's.
+    """
+    known, n_ticks = light.factors, len(light.factors)
     for _ in range(_ROUNDS):
         course = np.zeros(n_ticks)
         for stream, clock in zip(streams, clocks, strict=True):
@@ -68,6 +71,8 @@ def lamp(streams: Sequence[SpikeStream], clocks: Sequence[Clock], light: Light) 
             spike_trains.cache_clear()
             stream.release()
         course -= course.mean()
+        if not course.min() < 0:
+            return Light(known)
         light = Light(1 - course / course.min(), local=True)
     return light
 

@@ -93,6 +93,17 @@ def test_the_course_of_a_lamp_comes_from_the_pixels_that_it_lights(moving: float
     assert error < 0.13 and np.corrcoef(found.factors, true)[0, 1] > max(blurred, 0.995)
 
 
+def test_where_no_pixel_tells_a_lamp_the_course_that_blocks_show_is_the_light_of_all() -> None:
+    """With spikes at random no pixel is as even as a still one: nothing can be said of shares."""
+    (rates, shares), rng = world(), np.random.default_rng(7)
+    chance = rates * (1 + shares * (flashes()[:, None, None] - 1))
+    stream = SpikeStream(pack((rng.random(chance.shape) < chance).astype(np.uint8)), WIDTH, HEIGHT, RATE_HZ)
+    first = estimate_light([stream], [Clock()])
+    assert first is not None and first.local
+    found = lamp([stream], [Clock()], first)
+    assert not found.local and np.array_equal(found.factors, first.factors)
+
+
 @pytest.mark.parametrize("maker", [ADAPTIVE, INTERVALS], ids=lambda m: m.name)
 def test_images_show_the_light_of_their_tick(maker) -> None:
     """The exact twin is the world itself; light taken as the whole scene's is far from it."""
