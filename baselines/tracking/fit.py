@@ -120,9 +120,10 @@ def visits(first: int, times: int) -> list[Visit]:
 
 
 def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
-    """Fit Dynamic 3D Gaussians, from the job's checkpoint where it exists; it is written every `checkpoint_s` seconds.
+    """Fit Dynamic 3D Gaussians, from the job's checkpoint where it exists.
 
-    A resumed fit gives the bits of one that never stopped (on the CPU). Raises UserError for a damaged checkpoint or
+    It is written every `checkpoint_s` seconds once the first time is fitted: a fit that ends before starts anew. A
+    resumed fit gives the bits of one that never stopped (on the CPU). Raises UserError for a damaged checkpoint or
     one of another fit.
     """
     checkpoint, device = job.request.checkpoint, job.request.device
@@ -148,9 +149,11 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
 
 
 def first_index(job: FitJob) -> int:
-    """Return the index of the time that everything starts from."""
-    last = len(job.training_images.ticks) - 1
-    return min(max(round(job.settings["motion"].start * last), 0), last)
+    """Return the index of the time that everything starts from: of those that most views have measured, the nearest."""
+    images = job.training_images
+    last = len(images.ticks) - 1
+    lacking = [0] * (last + 1) if images.missing is None else images.missing.sum(1).tolist()
+    return min(range(last + 1), key=lambda i: (lacking[i], abs(i - round(job.settings["motion"].start * last))))
 
 
 def step_count(settings: TrackingSettings, visit: Visit) -> int:

@@ -85,6 +85,15 @@ def test_the_first_time_is_where_the_settings_say(start: float, index: int) -> N
     assert first_index(job(start=start)) == index
 
 
+@pytest.mark.parametrize(("lacking", "index"), [({2: 8}, 1), ({2: 3, 1: 4}, 3), ({i: 8 for i in range(TIMES)}, 2)])
+def test_the_first_time_is_one_that_most_views_have_measured(lacking: dict[int, int], index: int) -> None:
+    j = job()
+    missing = torch.zeros(TIMES, len(CAMERAS), dtype=torch.bool)
+    for time, views in lacking.items():
+        missing[time, :views] = True
+    assert first_index(replace(j, training_images=replace(j.training_images, missing=missing))) == index
+
+
 @cache
 def tracked() -> TrackedModel:
     return fit_tracking(job(first_steps=150, lr_means=3e-3, lr_means_last=1e-4, lr_colors=2.5e-4))
