@@ -120,7 +120,7 @@ def guide(
     for _, view, index in sorted(found)[:VIEWS]:
         t = images.ticks[index] / images.n_ticks
         out, image = _render(motion, gaussians, images, view, t)
-        target, camera = known(images.images[index, view], image), images.views.some([view])
+        target, camera = known(images.measured(index, [view])[0], image), images.views.some([view])
         pixels = bad_pixels(image, target)
         if len(pixels) >= 2:  # four points at least
             points = along_rays(camera, pixels, out, rng)
@@ -142,7 +142,7 @@ def _render(
 
 def _score(motion: Motion, gaussians: Gaussians, images: TrainingImages, view: int, index: int) -> float:
     _, image = _render(motion, gaussians, images, view, images.ticks[index] / images.n_ticks)
-    return float(ssim(image[None], images.images[index, view][None]))
+    return float(ssim(image[None], images.measured(index, [view])))
 
 
 def bad_pixels(rendered: Tensor, image: Tensor) -> Tensor:

@@ -347,6 +347,10 @@ def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     lamp = replace(g, colors=torch.cat([g.colors, torch.ones_like(g.colors)], dim=1))
     beside = motion.guided_samples(lamp, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
     assert beside.colors.shape[1] == 2 and not beside.colors[len(g) :, 1].any(), "new ones have no share of a lamp yet"
+    missing = torch.zeros(3, 4, dtype=torch.bool)
+    missing[2, 1] = True
+    lacking = TrainingImages(views, ticks, truth, 100, missing=missing)
+    assert [t for _, t in guide(motion, g, lacking, torch.Generator().manual_seed(0))] == [0.1], "nothing was measured"
     assert torch.equal(more.means[: len(g)], g.means) and set(more.extra["times"][len(g) :].tolist()) == {
         torch.tensor(t).item() for t in (0.9, 0.1)
     }
