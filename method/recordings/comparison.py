@@ -24,6 +24,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.training import ImageSettings, as_measured, make_images
+from spike4dgs.method.self_calibration.dark_drift import in_todays_dark
 
 TIMES = 9  # of the clip, that residuals are taken at
 SHOWN = (1, 4, 7)  # those of them that the sheet shows
@@ -51,6 +52,8 @@ def compare(
     maker = recipe.recipe.images if recipe else other.name
     make = recipe.maker(recipe.settings) if recipe else other
     settings: ImageSettings = recipe.settings["images"] if recipe else ImageSettings()  # type: ignore[assignment]
+    if settings.flat_field:
+        scene = in_todays_dark(scene)  # as the fit has it
     ticks, images = make_images(scene, make, replace(settings, max_times=TIMES), device)
     times = tuple(tick * 1e6 / scene.rate_hz for tick in ticks)
     rendered = np.stack([[model.render(camera, t) for camera in cameras] for t in times])

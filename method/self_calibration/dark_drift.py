@@ -10,7 +10,6 @@ A scale that its error does not tell from 1, or that changes rates by less than 
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -35,12 +34,7 @@ def in_todays_dark(scene: TrainingScene) -> TrainingScene:
         scale, error = dark_scale(rates(stream), calibration)
         if abs(scale - 1) > max(_LEAST, _ERRORS * error):
             states[camera.id] = replace(scene.state(camera.id), dark=max(scale, 0.0))
-    changed = [state.dark for state in states.values() if state.dark != 1]
-    if not changed:
-        return scene
-    text = f"{len(changed)} of {len(scene.cameras)} cameras have {min(changed):.2f} to {max(changed):.2f} times"
-    print(f"{text} the dark rate of their calibration", file=sys.stderr)
-    return replace(scene, states=states)
+    return replace(scene, states=states) if any(state.dark != 1 for state in states.values()) else scene
 
 
 def dark_scale(rate: Float64, calibration: Calibration) -> tuple[float, float]:

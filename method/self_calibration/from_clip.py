@@ -27,8 +27,11 @@ OFF = 1.15
 
 
 def as_in_clip(scene: TrainingScene, seed: int, poses: bool) -> TrainingScene:
-    """Return a scene with the dark rates that its clip tells and, where `poses` are used, with mended ones."""
+    """Return a scene with the dark rates that its clip tells and, where `poses` are used, with mended ones; say so."""
     found = in_todays_dark(scene)
+    if changed := [state.dark for state in found.states.values() if state.dark != 1]:
+        text = f"{len(changed)} of {len(scene.cameras)} cameras have {min(changed):.2f} to {max(changed):.2f} times"
+        print(f"{text} the dark rate of their calibration", file=sys.stderr)
     return at_mended_poses(found, seed) if poses else found
 
 

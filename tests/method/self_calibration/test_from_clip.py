@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from clock_world import ClockWorld
 from scipy.spatial.transform import Rotation
+from warm_cameras import warm_scene
 
 from spike4dgs.generators.physics import Physics, given_cameras
 from spike4dgs.method.self_calibration.from_clip import as_in_clip, at_mended_poses
@@ -38,6 +39,12 @@ def test_right_poses_stay_and_poses_a_little_off_are_mended(capsys: pytest.Captu
     assert turns_px(found) < 0.5 * turns_px(given)
     assert "the given poses are off" in capsys.readouterr().err
     assert as_in_clip(off, 0, poses=False) is off
+
+
+def test_other_dark_rates_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    warm = warm_scene((1.0, 2.0))
+    assert as_in_clip(warm, 0, poses=False).state("cam_01").dark == pytest.approx(2, abs=0.15)
+    assert "1 of 2 cameras have " in capsys.readouterr().err
 
 
 def test_a_clip_that_shows_too_little_changes_nothing() -> None:
