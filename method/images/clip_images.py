@@ -81,6 +81,7 @@ class ClipImages:
             "rate_hz": s.rate_hz,
             "rows_bottom_up": s.rows_bottom_up,
             **({"gaps": "filled"} if s.gaps else {}),
+            **({"dead_ticks": s.dead_ticks} if s.dead_ticks else {}),
         }
 
 
@@ -125,9 +126,9 @@ def _begun(folder: Path, video: Path, facts: dict[str, Any]) -> bool:
         raise problem(folder if folder.exists() else video, "nothing, or images of this command", "other files", other)
     found = read_json(folder / _NAME, "a description of images")
     complete = found.pop("complete", False)
-    if differing := [key for key in facts if found.get(key) != facts[key]]:
+    if differing := [key for key in {**facts, **found} if found.get(key) != facts.get(key)]:
         key = differing[0]
-        raise problem(folder, f"images with {key} {facts[key]}", f"{found.get(key)}", other)
+        raise problem(folder, f"images with {key} {facts.get(key)}", f"{found.get(key)}", other)
     return bool(complete) and video.is_file()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, add_gap, lose_ticks, shared
 
 from spike4dgs.baselines.images.published.makers import MAKERS
 from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.dat import import_dat
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.files import read_json
@@ -110,6 +112,16 @@ def test_what_is_finished_is_kept_and_nothing_is_overwritten(
     (tmp_path / "foreign/clip/notes.txt").write_text("mine")
     assert main([*arguments[:-1], str(tmp_path / "foreign")]) == 2
     assert "found other files" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.0, 2.0), (2.0, 0.0)])
+def test_images_of_another_sensor_are_not_kept(dat: Path, tmp_path: Path, first: float, second: float) -> None:
+    """Its dead ticks alone change the images of the same spikes."""
+    one, two = (replace(open_stream(dat, WIDTH, HEIGHT, 2e4), dead_ticks=ticks) for ticks in (first, second))
+    wanted = clip_images.ClipImages("cam", one, IMAGES["tfp"], every=40, gain=GAIN, fps=25.0)
+    assert clip_images.write_clip_images(tmp_path / "out", wanted)
+    with pytest.raises(UserError, match="images with dead_ticks"):
+        clip_images.write_clip_images(tmp_path / "out", replace(wanted, stream=two))
 
 
 def test_a_stopped_run_goes_on(dat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
