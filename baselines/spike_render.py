@@ -6,7 +6,7 @@ that generalises over illumination". Its equations and code are not. All of the 
 
     rate(x) = gain (I(x, t) exp(a(x)) + b(x))              a, b: noise embedding of every camera, learnt, 0 at first
     V_k = V_{k-1} + rate - s_{k-1},  s_k = [V_k >= 1]      integrate and fire, subtractive reset, M ticks around t
-    L = (1 - w) mean |S - R| + w (1 - SSIM(S, R)) + v mean (a^2 + b^2),   S = mean_k s_k / gain, R: recorded
+    L = (1 - w) mean |S - R| + w (1 - SSIM(S, R)) + v / 2 mean (a^2 + b^2),   S = mean_k s_k / gain, R: recorded
 
 Integrate-and-fire with subtractive reset is the camera's public model, and L1 with SSIM is 3DGS's loss. `gain` is the
 scene's spikes per tick of white, which a user knows, so that illumination needs no term of its own; of a camera whose
