@@ -177,6 +177,20 @@ def thinned(spikes: UInt8, keep_every: int) -> UInt8:
     return np.asarray((spikes > 0) & (number % np.uint64(keep_every) == 0), np.uint8)
 
 
+def flow_at(stream: SpikeStream, tick: int, network: Callable[..., Any]) -> Any:
+    """Return a network's flow in px per tick [2, H, W] from the start of a tick, of two windows [1, T, H, W] of spikes.
+
+    The second is a little later or, where the clip ends before, as much earlier.
+    """
+    import torch
+
+    from spike4dgs.baselines.images.published import scflow
+
+    apart = scflow.APART if tick + scflow.APART < stream.n_ticks else -scflow.APART
+    at = (window(stream, max(t, 0), scflow.TICKS) for t in (tick, tick + apart))
+    return network(*(torch.from_numpy(spikes)[None] for spikes in at))[0] / apart
+
+
 def scflow_image(stream: SpikeStream, tick: int, device: str) -> Float32:
     """Return spikes per tick [H, W]: the mean of 41 ticks along the flow from the start of a tick."""
     import torch
@@ -186,10 +200,8 @@ def scflow_image(stream: SpikeStream, tick: int, device: str) -> Float32:
     path = find_weights(SCFLOW.file).path
     network = load_network("scflow", SCFLOW, path, choose_device(device, rasterizes=False))
     on = next(network.parameters()).device
-    at = [window(stream, min(t, stream.n_ticks - 1), scflow.TICKS) for t in (tick, tick + scflow.APART)]
     with torch.inference_mode():
-        first, second = (torch.from_numpy(spikes).to(on, torch.float32)[None] for spikes in at)
-        flow = network(first, second)[0] / scflow.APART
+        flow = flow_at(stream, tick, lambda *windows: network(*(spikes.to(on, torch.float32) for spikes in windows)))
         spikes = torch.from_numpy(window(stream, tick, _ALONG)).to(on, torch.float32)
         rate: Float32 = scflow.mean_along(spikes, flow).cpu().numpy()
     return rate

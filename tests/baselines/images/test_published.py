@@ -20,6 +20,7 @@ from spike4dgs.baselines.images.published.makers import (
     SPIKECLIP,
     SSIR,
     SSML,
+    flow_at,
     load_network,
     thinned,
 )
@@ -153,6 +154,18 @@ def test_scflow_finds_a_drift_and_averages_along_it(px_per_tick: float, weights:
         for maker in (BY_NAME["scflow-tfp"], TFP)
     ]
     assert errors[0] < (0.7 if abs(px_per_tick) > 0.2 else 1.1) * errors[1]
+
+
+@pytest.mark.parametrize("tick", [0, 60, 109, 110, 119])
+def test_flow_is_per_tick_to_the_ends_of_a_clip(tick: int) -> None:
+    """The network is one that sees how far the only pixel that fires has come."""
+    stream = SpikeStream(pack(np.eye(120, dtype=np.uint8)[:, None]), 120, 1, 20_000.0)
+
+    def shift(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+        here, there = (int(spikes[0, scflow.TICKS // 2, 0].argmax()) for spikes in (first, second))
+        return torch.tensor([float(there - here), 0.0]).view(1, 2, 1, 1)
+
+    assert flow_at(stream, tick, shift).flatten().tolist() == [1, 0]
 
 
 @pytest.mark.parametrize("name", sorted(BY_NAME))
