@@ -178,7 +178,7 @@ class Trainer:
         self.step += 1
         if self.density.ahead(self.step - stage.first, stage.steps):
             for out in outputs:
-                self.statistics.add(out)
+                self.statistics.add(out, len(outputs))
         self._adapt_density(stage)
         self._average(stage)
         return loss.detach()

@@ -62,14 +62,18 @@ class GradientStatistics:
         """Return statistics of `n` Gaussians with nothing gathered yet."""
         return cls(torch.zeros(n, device=device), torch.zeros(n, device=device))
 
-    def add(self, out: RenderOutput) -> None:
-        """Gather one rendered batch after its backward pass. Units as in 3DGS, whose thresholds are customary."""
+    def add(self, out: RenderOutput, renders: int = 1) -> None:
+        """Gather one rendered batch after its backward pass. Units as in 3DGS, whose thresholds are customary.
+
+        A loss of the mean of so many `renders` gives each of them as small a part of the gradient of one.
+        """
         grad = out.means2d.grad
         if grad is None:
             return
         views, height, width = out.alpha.shape
         visible = out.visible
-        length = torch.hypot(grad[..., 0] * (width / 2 * views), grad[..., 1] * (height / 2 * views))
+        batch = views * renders
+        length = torch.hypot(grad[..., 0] * (width / 2 * batch), grad[..., 1] * (height / 2 * batch))
         self.gradient += torch.where(visible, length, 0.0).sum(0).float()
         self.seen += visible.sum(0)
 

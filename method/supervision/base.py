@@ -37,7 +37,7 @@ class Supervision(nn.Module):
     defaults: ClassVar[Settings] = Settings()  # of the supervision's own settings
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
-        """Return the scalar loss of a training step."""
+        """Return the scalar loss of a training step; where it renders several times, of their mean."""
         raise NotImplementedError
 
     def groups(self) -> dict[str, tuple[list[nn.Parameter], Decay]]:

@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sensor_recordings import keys_of, record
-from toy_fits import silent
+from toy_fits import SUPERVISIONS, silent
 from toy_world import RATE_HZ, ToyWorld
 
 from spike4dgs.baselines.exposure import Exposure, ExposureSettings
@@ -24,11 +24,20 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.other_sensors import exposures
 from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.gaussians.density import DensitySettings
+from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.recorded import Recorded
+from spike4dgs.method.motion.base import Extent
+from spike4dgs.method.motion.table import Static
+from spike4dgs.method.schedule import TrainerSettings
+from spike4dgs.method.splat import Views
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.clip import ImageClip
 from spike4dgs.method.starts.rig import rig
 from spike4dgs.method.supervision.base import Sample
+from spike4dgs.method.torch_state import seeded
+from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=48, height=30, n_ticks=520, travel=0.3)  # two frames
 QUICK = FitRequest(Budget(0.004), progress=silent)
@@ -121,6 +130,23 @@ def test_the_mean_of_rendered_instants_is_the_generators_frame() -> None:
     times.clear()
     Exposure(ExposureSettings(), WORLD.training)(render, replace(sample, exposure_ticks=0))
     assert times == [sample.t]
+
+
+def test_a_scene_at_rest_is_densified_by_exposures_as_by_instants() -> None:
+    cameras = WORLD.cameras[:3]
+    frames = torch.from_numpy(np.stack([WORLD.trace(c, 0.5)[0] for c in cameras]).astype(np.float32))[None]
+    images = TrainingImages(Views.from_cameras(cameras), (260,), frames, WORLD.n_ticks, exposure_ticks=167)
+    means = []
+    for supervision in ("pixel", "exposure"):
+        loss = SUPERVISIONS[supervision](SUPERVISIONS[supervision].defaults, WORLD.training)
+        gaussians = from_points(*WORLD.surfaces(cameras[:1], 0.01), opacity=0.5)
+        settings, density = TrainerSettings(coarse_steps=10, fine_steps=0), DensitySettings()
+        motion = Static(Extent(-torch.ones(3), torch.ones(3), 2.0, 520, 48), Static.defaults, seeded(0, -1))
+        trainer = Trainer(images, gaussians, motion, loss, settings, density, scale=2.0, seed=0)
+        trainer.train_step()
+        means.append(trainer.statistics.mean())
+    assert (means[0] > 0).float().mean() > 0.9
+    torch.testing.assert_close(means[1], means[0], rtol=1e-3, atol=1e-3 * float(means[0].mean()))
 
 
 def test_first_points_of_images_lie_on_surfaces_as_often_as_those_of_spikes(scene: TrainingScene) -> None:
