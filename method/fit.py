@@ -35,7 +35,7 @@ from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.self_calibration.from_clip import as_in_clip
 from spike4dgs.method.self_calibration.shading import with_shadings
 from spike4dgs.method.settings import FLAT_FIELD, Settings, SettingsByPart, as_dict, follow_images, override, scaled
-from spike4dgs.method.starts.base import Initialization, Start, StartRequest, at_most, measure
+from spike4dgs.method.starts.base import Initialization, Start, StartRequest, at_most, learned_facts, measure
 from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.torch_state import check_device, kept_random_state, seeded
 from spike4dgs.method.trainer import Trainer
@@ -128,9 +128,8 @@ class RecipeMethod(Shown):
             expected, named = "parts that take nothing of spikes", f"{recipe.initialization}, {recipe.supervision}"
             raise problem(f"recipe {self.name}", expected, named, "change them, or the images")
         self.description = description or describe(recipe, parts, self.algorithm)
-        self.trained_on: tuple[str, ...] = ()
-        if learned := self.images.learned():
-            self.params["weights_sha256"], self.trained_on = learned.sha256, learned.trained_on
+        weights, self.trained_on = learned_facts(self.images.learned(), self.initialization.learned())
+        self.params |= weights
         self._warm: set[str] = set()  # the devices whose kernels are compiled
 
     def _about(self) -> str:

@@ -6,6 +6,7 @@ images and points.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.image_network.maker import MSDI
 from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.intervals import INTERVALS
+from spike4dgs.method.matching.weights import WEIGHTS as MATCHER
 from spike4dgs.method.motion.table import MOTIONS
-from spike4dgs.method.starts.base import Initialization
+from spike4dgs.method.msdi.weights import WEIGHTS as POINTS
+from spike4dgs.method.starts.base import Initialization, other_weights
 from spike4dgs.method.starts.matching import MatchedSettings, matched
 from spike4dgs.method.starts.msdi import MsdiSettings, msdi
 from spike4dgs.method.starts.rig import RigSettings, rig
@@ -30,7 +33,11 @@ PARTS = Parts(
             lambda r: rig(r.scene, r.settings, r.recorded), RigSettings(), label="", from_recorded=True
         ),
         "msdi": Initialization(
-            lambda r: msdi(r.scene, r.settings, r.device), MsdiSettings(), label="points by MSDI", calibrated=True
+            lambda r: msdi(r.scene, r.settings, r.device),
+            MsdiSettings(),
+            label="points by MSDI",
+            calibrated=True,
+            learned=partial(other_weights, POINTS),
         ),
         "matched": Initialization(
             lambda r: matched(r.scene, r.seed, r.settings, r.device),
@@ -38,6 +45,7 @@ PARTS = Parts(
             label="poses by the matching network and features",
             estimates_poses=True,
             calibrated=True,
+            learned=partial(other_weights, MATCHER, POINTS),
         ),
     },
     motion=MOTIONS,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +14,11 @@ from torch import Tensor
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.weights import FoundWeights
 from spike4dgs.method.array_path import ArrayPath
+from spike4dgs.method.images.base import Learned, learned_from
 from spike4dgs.method.images.recorded import Recorded
+from spike4dgs.method.models.network_weights import WeightKind
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.settings import Settings
 
@@ -54,6 +57,24 @@ class Initialization:
     estimates_poses: bool = False  # those given serve for nothing but the frame
     calibrated: bool = False  # takes the cameras' calibrations, whether `flat_field` or not
     from_recorded: bool = False  # takes images of other sensors where a recipe has some
+    learned: Callable[[], tuple[Learned, ...]] = tuple  # weights in use in place of the included ones
+
+
+def other_weights(*kinds: WeightKind[Any]) -> tuple[Learned, ...]:
+    """Return the weights of these networks that are in use in place of the included ones, as far as they can be read.
+
+    The package's version names the included ones, which have seen nothing that is scored.
+    """
+    found = [(kind, learned_from(kind.in_use, kind.read_card)) for kind in kinds]
+    return tuple(used for kind, used in found if used and used.sha256 != FoundWeights(kind.shipped).sha256)
+
+
+def learned_facts(images: Learned | None, start: Sequence[Learned]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return what a method's parameters say of the weights of its images and its start, and what these have seen."""
+    facts: dict[str, Any] = {"weights_sha256": images.sha256} if images else {}
+    facts |= {"start_weights_sha256": [used.sha256 for used in start]} if start else {}
+    seen = [name for used in (*([images] if images else ()), *start) for name in used.trained_on]
+    return facts, tuple(dict.fromkeys(seen))
 
 
 def at_most(count: int, start: Start, seed: int) -> tuple[Float32, Float32]:

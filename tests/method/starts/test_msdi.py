@@ -13,14 +13,25 @@ from hypothesis import strategies as st
 from toy_world import GAIN, ToyWorld
 
 from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.method import Budget
+from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.weights import WeightsError
+from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.image_network.weights import VARIABLE as IMAGES_VARIABLE
+from spike4dgs.method.matching.config import TINY as MATCHER_TINY
+from spike4dgs.method.matching.network import Matcher
+from spike4dgs.method.matching.weights import VARIABLE as MATCHER_VARIABLE
+from spike4dgs.method.matching.weights import WEIGHTS as MATCHER
+from spike4dgs.method.models.network_weights import ConfigCard
 from spike4dgs.method.msdi.config import TINY
 from spike4dgs.method.msdi.network import Msdi
 from spike4dgs.method.msdi.training_data import points_of
 from spike4dgs.method.msdi.weights import VARIABLE, WEIGHTS, Card, load_network
+from spike4dgs.method.recipes import METHODS, PARTS
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.clip import SpikeClip
 from spike4dgs.method.starts.msdi import (
@@ -149,6 +160,31 @@ def random_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     WEIGHTS.save(path, Msdi(TINY), Card("tiny", 0, 0, ("toy-1",), {}))
     monkeypatch.setenv(VARIABLE, str(path))
     return path
+
+
+@pytest.mark.parametrize("name", ["spike4dgs", "spike4dgs-uncalibrated"])
+def test_other_weights_of_the_start_are_another_method(
+    name: str, one_small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = METHODS[name]
+    path = tmp_path / "network.safetensors"
+    path.write_bytes(WEIGHTS.shipped.read_bytes())
+    monkeypatch.setenv(VARIABLE, str(path))
+    again = RecipeMethod(shipped.recipe, PARTS)
+    assert (again.params, again.trained_on) == (shipped.params, shipped.trained_on), "a copy of the included weights"
+    WEIGHTS.save(path, Msdi(TINY), Card("tiny", 0, 0, ("car-0@1234",), {}))
+    if name != "spike4dgs":
+        card = ConfigCard(MATCHER_TINY.name, 0, 0, ("bird-0@5678",))
+        MATCHER.save(tmp_path / "matcher.safetensors", Matcher(MATCHER_TINY), card)
+        monkeypatch.setenv(MATCHER_VARIABLE, str(tmp_path / "matcher.safetensors"))
+    changed, scene = RecipeMethod(shipped.recipe, PARTS), open_scene(one_small_scene)
+    jobs = [Job(m, scene, 0, "cpu", Budget()) for m in (shipped, changed)]
+    assert jobs[0].key != jobs[1].key
+    added = jobs[1].info.trained_on[len(shipped.trained_on) :]
+    assert added == (("car-0@1234",) if name == "spike4dgs" else ("bird-0@5678", "car-0@1234"))
+    assert jobs[1].info.trained_on[: -len(added)] == shipped.trained_on
+    assert changed.params["weights_sha256"] == shipped.params["weights_sha256"]
+    assert sha256_file(path) in changed.params["start_weights_sha256"]
 
 
 def test_the_network_in_use_sees_the_middle_of_the_clip(random_network: Path) -> None:
