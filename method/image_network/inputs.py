@@ -47,10 +47,8 @@ def image_inputs(stream: SpikeStream, tick: int, sensor: Maps | None = None, of_
     windows = rates_over_windows(stream, tick, sensor)
     roots = windows.roots()
     last = stream.n_ticks - 1
-    beside = [
-        roots_of(corrected_rates(adaptive_image(stream, min(max(tick + d, 0), last)), sensor), windows.mean)
-        for d in (-BESIDE, BESIDE)
-    ]
+    near = [adaptive_image(stream, min(max(tick + d, 0), last)) for d in (-BESIDE, BESIDE)]
+    beside = [roots_of(corrected_rates(rates, sensor, stream.dead_ticks), windows.mean) for rates in near]
     known = np.zeros((2, stream.height, stream.width), np.float32)
     if sensor and of_pixels:
         known[0], known[1] = sensor[0] - 1, 1

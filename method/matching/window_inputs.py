@@ -20,11 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.spikes.sensor_model import fired, gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.adaptive import AdaptiveSettings, half_windows, rates, shared_levels
 
 CHANNELS = 4
 _MOST = 4.0  # of a root, in roots of the mean: a hot pixel must not outshine everything
+_PART = 65535  # ticks counted at once
 _LEAST = 1e-4  # spikes per tick: the mean of an image that is dark throughout
 
 Maps = tuple[Float32, Float32]  # relative sensitivity and dark rate [H, W]
@@ -60,17 +62,24 @@ def rates_over_windows(stream: SpikeStream, tick: int, sensor: Maps | None = Non
     found = [rates(stream, tick, settings, which) for which in (levels, np.zeros_like(levels))]
     ticks = np.minimum(2 * half_windows(stream.n_ticks, settings)[levels], stream.n_ticks)
     adaptive, short, length = (_upright(stream, image) for image in (*found, ticks.astype(np.float32)))
-    whole = stream.counts(0, min(stream.n_ticks, 65535)).astype(np.float32) / min(stream.n_ticks, 65535)
-    images = corrected_rates(np.stack([adaptive, short, whole]), sensor)
+    # Not `total_counts`: it gives back the stream's pages, which the next instant reads again.
+    parts = [stream.counts(a, min(a + _PART, stream.n_ticks)) for a in range(0, stream.n_ticks, _PART)]
+    whole = np.sum(parts, axis=0, dtype=np.int64).astype(np.float32) / stream.n_ticks
+    images = corrected_rates(np.stack([adaptive, short, whole]), sensor, stream.dead_ticks)
     return Windows(images, np.asarray(np.log2(length) / 8, np.float32), max(float(images[2].mean()), _LEAST))
 
 
-def corrected_rates(images: Float32, sensor: Maps | None) -> Float32:
-    """Return the rates [..., H, W] of an ideal sensor, not negative."""
-    if sensor:
-        gain, dark = sensor
-        images = (images - dark) * np.where(gain > 0, 1 / np.where(gain > 0, gain, 1), 0)
-    return np.maximum(images, 0)
+def corrected_rates(images: Float32, sensor: Maps | None, dead_ticks: float) -> Float32:
+    """Return the rates [..., H, W] of an ideal sensor with the same dead ticks, not negative.
+
+    The maps of the sensor are of the charge, which is in proportion to light.
+    """
+    if not sensor:
+        return np.maximum(images, 0)
+    gain, dark = sensor
+    charge = (gathered(images, dead_ticks) - dark) * np.where(gain > 0, 1 / np.where(gain > 0, gain, 1), 0)
+    rates: Float32 = fired(np.maximum(charge, 0), dead_ticks)
+    return rates
 
 
 def roots_of(rates: Float32, mean: float) -> Float32:

@@ -27,6 +27,9 @@ from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.counted_recording import total_counts
+from spike4dgs.benchmark.spikes.sensor_model import fired, gathered
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.base import window
 from spike4dgs.method.msdi.inputs import Sensors, shrink
 from spike4dgs.method.msdi.weights import WEIGHTS, load_network
@@ -34,6 +37,8 @@ from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.clip import SpikeClip
 from spike4dgs.method.starts.rig import Cloud, PointSettings, filled, matched
 from spike4dgs.method.training_views.pinholes import nearest_pixels
+
+_LEAST = 1e-4  # charge per tick: the mean light of a clip that is dark throughout
 
 
 @dataclass(frozen=True)
@@ -92,11 +97,13 @@ def infer(
     K = torch.from_numpy(np.stack([c.K for c in cameras])[None].astype(np.float32))
     sensors, gain = None, scene.radiance_gain
     if calibrations := scene.calibrations:
-        sensors = block_means(at_pinholes(scene, calibrations), factor, device)
+        of_spikes = [spikes_response(*pair) for pair in zip(scene.streams, calibrations, strict=True)]
+        sensors = block_means(at_pinholes(scene, of_spikes), factor, device)
         gain = float(np.mean([c.radiance_gain for c in calibrations]))
     with torch.inference_mode():
         found = network(small.to(device), K.to(device) if calibrated else None, sensors)
-    images = found.images[0].clamp(min=0).cpu().numpy() / np.float32(gain)
+    rates = zip(found.images[0].clamp(min=0).cpu().numpy(), scene.streams, strict=True)
+    images = np.stack([gathered(image, stream.dead_ticks) for image, stream in rates]) / np.float32(gain)
     points, confidence = (x[0].double().cpu().numpy() for x in (found.points, found.confidence))
     return Estimate(factor, cameras, images, points, confidence)
 
@@ -106,6 +113,20 @@ def shrunk(camera: Camera, factor: int) -> Camera:
     width, height = -(-camera.width // factor), -(-camera.height // factor)
     fx, fy, cx, cy = (x / factor for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def spikes_response(stream: SpikeStream, camera: Calibration) -> Calibration:
+    """Return the response of a camera's spikes to light, which its calibration tells of the charge.
+
+    With dead ticks spikes are not in proportion to light. The response is then right at the mean light of the clip.
+    """
+    if not (dead := stream.dead_ticks):
+        return camera
+    charge = gathered(float(total_counts(stream).mean()) / stream.n_ticks, dead)
+    light = max(charge - float(camera.mean_dark), _LEAST)
+    dark = fired(camera.dark, dead)
+    gain = (fired(camera.gain * light + camera.dark, dead) - dark) / fired(light, dead)
+    return replace(camera, gain=gain.astype(np.float32), dark=dark.astype(np.float32))
 
 
 def at_pinholes(scene: TrainingScene, calibrations: Sequence[Calibration]) -> list[Calibration]:

@@ -27,7 +27,7 @@ from spike4dgs.method.image_network.training.train import ImageNetworkTraining, 
 from spike4dgs.method.image_network.weights import WEIGHTS, load_image_network
 from spike4dgs.method.images.adaptive import adaptive_image
 from spike4dgs.method.matching.training.data import at_light, record
-from spike4dgs.method.matching.window_inputs import window_inputs
+from spike4dgs.method.matching.window_inputs import rates_over_windows, window_inputs
 
 SETTINGS = ImageTraining(steps=6, bursts=2, views=1, instants=2, warm_up=2, longest=120)
 
@@ -52,6 +52,13 @@ def test_inputs_are_adaptive_images_in_roots_of_the_clips_mean() -> None:
     np.testing.assert_allclose(found.channels[6], gain - 1, atol=1e-6)
     assert (found.channels[7] == 1).all()
     np.testing.assert_array_equal(found.spikes, stream.window(30, 71))
+
+
+def test_the_whole_stream_is_more_than_its_first_65535_ticks() -> None:
+    """Light of 0.1 spikes a tick, then of 0.5 in as many ticks."""
+    spikes = np.zeros((131_070, 2, 4), bool)
+    spikes[5:65_535:10] = spikes[65_535::2] = True
+    assert rates_over_windows(SpikeStream(pack(spikes), 4, 2, 20_000.0), 100).mean == pytest.approx(0.3, abs=1e-4)
 
 
 def test_a_sensor_that_is_not_known_leaves_its_channels_at_nothing() -> None:
