@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, Mask
+from spike4dgs.benchmark.arrays import Float32, Float64, Mask
 from spike4dgs.benchmark.scene.camera_state import Clock, local_window
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.sensor_model import gathered
@@ -101,8 +101,13 @@ def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) 
     if flat_field and scene.calibrations:
         means = np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
     else:
-        means = rates / np.float32(scene.radiance_gain)
+        means = rates / white_rates(scene).astype(np.float32)
     return undistorted(scene, means, unseen=None)
+
+
+def white_rates(scene: TrainingScene) -> Float64:
+    """Return the spikes per tick of white [C, 1, 1] of cameras whose calibration is not used."""
+    return np.array([scene.radiance_gain * scene.state(camera.id).gain for camera in scene.cameras])[:, None, None]
 
 
 def _marked(scene: TrainingScene, images: Float32) -> Float32:

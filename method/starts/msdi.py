@@ -7,7 +7,7 @@ view 0's frame, at a scale of its own.
 Poses are the calibrated ones, which are better than any estimate. From known poses, matches of the views are measured
 better than a network guesses them: those are the points of `rig` with `flat_field`. Where nothing matches, for lack of
 texture, the network's points replace the nearest depth: those of view 0, as inverse depths that a line brings to the
-matched ones.
+matched ones. Cameras around their subject start as `rig` does there, without the network.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from spike4dgs.method.images.base import window
 from spike4dgs.method.msdi.inputs import Sensors, shrink
 from spike4dgs.method.msdi.weights import WEIGHTS, load_network
 from spike4dgs.method.starts.base import Start
-from spike4dgs.method.starts.clip import SpikeClip
-from spike4dgs.method.starts.rig import Cloud, PointSettings, filled, matched
+from spike4dgs.method.starts.clip import SpikeClip, white_rates
+from spike4dgs.method.starts.rig import Cloud, PointSettings, filled, matched, swept
+from spike4dgs.method.starts.surrounding import looked_at
 from spike4dgs.method.training_views.pinholes import nearest_pixels
 
 _LEAST = 1e-4  # charge per tick: the mean light of a clip that is dark throughout
@@ -76,8 +77,11 @@ def msdi(scene: TrainingScene, settings: MsdiSettings = DEFAULTS, device: str = 
 
     Raises WeightsError where there are no weights, UserError where all cameras have one centre.
     """
+    clip = SpikeClip(scene, settings.window_ticks, flat_field=True)
+    if looked_at(scene.cameras) is not None:
+        return swept(scene, settings, clip)
     estimate = infer(scene, settings, device, calibrated=True)
-    cloud, mean = matched(scene, settings, SpikeClip(scene, settings.window_ticks, flat_field=True))
+    cloud, mean = matched(scene, settings, clip)
     return filled(scene, completed(cloud, estimate, settings), mean, settings)
 
 
@@ -95,15 +99,15 @@ def infer(
     small = shrink(torch.from_numpy(spikes), factor)[None]
     cameras = tuple(shrunk(camera, factor) for camera in scene.cameras)
     K = torch.from_numpy(np.stack([c.K for c in cameras])[None].astype(np.float32))
-    sensors, gain = None, scene.radiance_gain
+    sensors, gain = None, white_rates(scene)
     if calibrations := scene.calibrations:
         of_spikes = [spikes_response(*pair) for pair in zip(scene.streams, calibrations, strict=True)]
         sensors = block_means(at_pinholes(scene, of_spikes), factor, device)
-        gain = float(np.mean([c.radiance_gain for c in calibrations]))
+        gain = np.mean([c.radiance_gain for c in calibrations], keepdims=True)
     with torch.inference_mode():
         found = network(small.to(device), K.to(device) if calibrated else None, sensors)
     rates = zip(found.images[0].clamp(min=0).cpu().numpy(), scene.streams, strict=True)
-    images = np.stack([gathered(image, stream.dead_ticks) for image, stream in rates]) / np.float32(gain)
+    images = np.stack([gathered(image, stream.dead_ticks) for image, stream in rates]) / gain.astype(np.float32)
     points, confidence = (x[0].double().cpu().numpy() for x in (found.points, found.confidence))
     return Estimate(factor, cameras, images, points, confidence)
 

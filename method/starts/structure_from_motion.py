@@ -27,6 +27,7 @@ from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.method.settings import Settings
+from spike4dgs.method.starts.clip import white_rates
 from spike4dgs.method.training_views.pinholes import undistorted
 
 if TYPE_CHECKING:  # its import takes over the handling of SIGTERM: left to those who use it
@@ -202,7 +203,7 @@ def clip_means(scene: TrainingScene) -> Float32:
     """Return the mean radiance of each training view over the clip (its first 65535 ticks) [C, H, W]."""
     ticks = min(scene.n_ticks, 65535)
     counts = [gathered(s.counts(0, ticks).astype(np.float32), s.dead_ticks / ticks) for s in scene.streams]
-    means = np.asarray(np.stack(counts) / np.float32(ticks * scene.radiance_gain), np.float32)
+    means = np.asarray(np.stack(counts) / (ticks * white_rates(scene)).astype(np.float32), np.float32)
     return undistorted(scene, means, unseen=None)
 
 

@@ -17,6 +17,7 @@ from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.method import Budget
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.weights import WeightsError
@@ -191,6 +192,13 @@ def test_the_network_in_use_sees_the_middle_of_the_clip(random_network: Path) ->
     estimate = infer(SCENE, calibrated=True)
     assert estimate.factor == 1 and estimate.points.shape == (8, 61, 96, 3) and estimate.images.shape == (8, 61, 96)
     assert np.isfinite(estimate.points).all() and (estimate.confidence > 1).all()
+
+
+def test_the_networks_gray_is_in_each_cameras_own_white(random_network: Path) -> None:
+    gains = np.linspace(0.5, 1.5, len(SCENE.cameras), dtype=np.float32)
+    states = {c.id: CameraState(gain=float(g)) for c, g in zip(SCENE.cameras, gains, strict=True)}
+    plain, own = (infer(s, calibrated=True).images for s in (SCENE, replace(SCENE, states=states)))
+    np.testing.assert_allclose(own, plain / gains[:, None, None], rtol=1e-5)
 
 
 def test_without_calibration_the_network_is_not_told_the_intrinsics(random_network: Path) -> None:

@@ -3,16 +3,19 @@ from dataclasses import asdict
 import cv2
 import numpy as np
 import pytest
+from small_scenes import array_cameras
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
 from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Recipe
+from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.starts.base import StartRequest
+from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.starts.plane_sweep import (
     agreed,
     find_range,
@@ -23,6 +26,7 @@ from spike4dgs.method.starts.plane_sweep import (
     sweep,
 )
 from spike4dgs.method.starts.rig import RigSettings, middle_camera, rig
+from spike4dgs.method.starts.structure_from_motion import clip_means
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=160, travel=0.25, seed=1)
 
@@ -130,6 +134,18 @@ def test_scene_without_any_texture_still_gives_points(spikes):
     streams = tuple(SpikeStream(packed, 20, 12, RATE_HZ) for _ in cameras)
     start = rig(TrainingScene("flat", "flat", cameras, streams, RATE_HZ, 40, GAIN))
     assert len(start.points) > 20 and np.isfinite(start.points).all() and np.isfinite(start.values).all()
+
+
+@pytest.mark.parametrize("means", [lambda s: window_means(s, 0, 200, flat_field=True), clip_means])
+def test_cameras_of_known_gains_see_one_light(means):
+    """Gains of 0.5 and 1.5 in light of 0.5: spikes in one and in three of eight ticks."""
+    spikes = np.zeros((2, 200, 8, 16), bool)
+    spikes[0, ::8] = spikes[1, ::8] = spikes[1, 2::8] = spikes[1, 4::8] = True
+    streams = tuple(SpikeStream(pack(s), 16, 8, RATE_HZ) for s in spikes)
+    cameras = array_cameras(2, 16, 8)
+    states = {c.id: CameraState(gain=g) for c, g in zip(cameras, (0.5, 1.5), strict=True)}
+    scene = TrainingScene("lit", "lit", cameras, streams, RATE_HZ, 200, 0.5, states=states)
+    np.testing.assert_allclose(means(scene), 0.5, rtol=1e-6)
 
 
 def test_a_recipe_overrides_the_cell_size_and_its_record_shows_it(start):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,11 @@ from PIL import Image
 from small_scenes import array_cameras
 
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
-from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.generators.held_frames.footage import find_footage
 from spike4dgs.generators.held_frames.scene import Holding, write_held_frames
+from spike4dgs.method.starts.base import Start
+from spike4dgs.method.starts.msdi import msdi
 from spike4dgs.method.starts.rig import rig
 from spike4dgs.method.starts.surrounding import looked_at, points_inside
 
@@ -60,7 +63,10 @@ def test_points_lie_in_the_ball_and_in_two_images_and_are_the_same_again() -> No
     np.testing.assert_array_equal(points, points_inside(ball, cameras))
 
 
-def test_the_start_of_a_ring_has_points_where_its_cameras_look_with_what_they_see(tmp_path: Path) -> None:
+@pytest.mark.parametrize("first", [rig, msdi])
+def test_the_start_of_a_ring_has_points_where_its_cameras_look_with_what_they_see(
+    first: Callable[[TrainingScene], Start], tmp_path: Path
+) -> None:
     cameras = ring()
     for c in cameras:
         (tmp_path / "footage" / c.id).mkdir(parents=True)
@@ -68,7 +74,7 @@ def test_the_start_of_a_ring_has_points_where_its_cameras_look_with_what_they_se
     holding = Holding(held_out="cam_02", hold_ticks=200, linear=True)
     write_held_frames(tmp_path / "scene", find_footage(tmp_path / "footage"), cameras, holding)
     scene = open_scene(tmp_path / "scene").training
-    start = rig(scene)
+    start = first(scene)
     assert np.abs(np.median(start.points, axis=0) - CENTER).max() < 0.002  # the cameras are 0.12 away
     assert np.median(start.values) == pytest.approx(128 / 255, abs=0.03)
     assert [c.id for c in start.cameras] == [c.id for c in scene.cameras]
