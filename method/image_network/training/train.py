@@ -139,6 +139,14 @@ def run(training: ImageNetworkTraining, key: str, out: Path) -> None:
     recent: list[tuple[float, float]] = []
     saved = start = time.perf_counter()
     first = training.step
+
+    def export() -> None:
+        card = ConfigCard(training.network.config.name, training.step, training.seed, seen)
+        WEIGHTS.save(out / "images.safetensors", training.network, card)
+        curve.write()
+
+    if first == last:
+        export()  # a run that ended may lack them
     for batch in training.batches():
         recent.append(training.train_step(batch))
         step, now = training.step, time.perf_counter()
@@ -151,11 +159,6 @@ def run(training: ImageNetworkTraining, key: str, out: Path) -> None:
         note = f"{gained:+.2f} dB on adaptive, {moving:+.2f} where things move"
         print(f"step {step}/{last}: {note}; {now - start:.0f} s, about {left:.0f} s left", flush=True)
         if now - saved > _SAVE_EVERY_S or step == last:
+            export()  # before the checkpoint, which says that they are there
             training.save(checkpoint, key)
-            WEIGHTS.save(
-                out / "images.safetensors",
-                training.network,
-                ConfigCard(training.network.config.name, step, training.seed, seen),
-            )
-            curve.write()
             saved = now

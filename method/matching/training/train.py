@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
@@ -117,7 +118,10 @@ def training_key(config: MatcherConfig, settings: MatcherTraining, seed: int, st
 
 
 def run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float = _SAVE_EVERY_S) -> None:
-    """Train up to a step in one thread, with checkpoint, weights, losses and list of shards in `out`."""
+    """Train up to a step in one thread, with checkpoint, weights, losses and list of shards in `out`.
+
+    Raises UserError where the weights that begin the training have that step behind them.
+    """
     with one_torch_thread():
         _run(training, steps, key, out, save_every_s)
 
@@ -125,11 +129,22 @@ def run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: 
 def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s: float) -> None:
     checkpoint, losses = out / "checkpoint.safetensors", out / "losses.csv"
     resumed = training.resume(checkpoint, key)
+    if not resumed and training.step >= steps:
+        expected = f"more than the {training.step} steps of the weights that begin the training"
+        raise problem("--steps", expected, str(steps), "give a larger number")
     seen = note_shards(out / "trained_on.json", training.files, training.shards, fresh=not resumed)
     curve = Curve(losses, training.step)
     recent: list[MatchLosses] = []
     saved = start = time.perf_counter()
     first = training.step
+
+    def export() -> None:
+        card = ConfigCard(training.network.config.name, training.step, training.seed, seen)
+        WEIGHTS.save(out / "matcher.safetensors", training.network, card)
+        curve.write()
+
+    if first >= steps:
+        export()  # a run that ended may lack them
     while training.step < steps:
         recent.append(training.train_step())
         step, now = training.step, time.perf_counter()
@@ -142,8 +157,6 @@ def _run(training: MatchTraining, steps: int, key: str, out: Path, save_every_s:
         shown = ", ".join(f"{name} {value:.3f}" for name, value in row.items())
         print(f"step {step}/{steps}: {shown}; {now - start:.0f} s, about {left:.0f} s left", flush=True)
         if now - saved > save_every_s or step == steps:
+            export()  # before the checkpoint, which says that they are there
             training.save(checkpoint, key)
-            config = training.network.config.name
-            WEIGHTS.save(out / "matcher.safetensors", training.network, ConfigCard(config, step, training.seed, seen))
-            curve.write()
             saved = now

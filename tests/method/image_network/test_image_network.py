@@ -229,6 +229,9 @@ def test_a_killed_training_goes_on_with_the_same_bits(tmp_path: Path, files) -> 
         assert torch.equal(tensor, saved[1].tensors[name]), name
     card = WEIGHTS.read_card(tmp_path / "whole" / "images.safetensors")
     assert card.steps == 6 and len(card.trained_on) == 2
+    (tmp_path / "parts" / "images.safetensors").unlink()
+    run(ImageNetworkTraining(files, TINY, SETTINGS, "cpu", 0), key, tmp_path / "parts")
+    assert WEIGHTS.read_card(tmp_path / "parts" / "images.safetensors") == card
 
 
 def test_a_training_begins_with_given_weights_and_their_shards(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]

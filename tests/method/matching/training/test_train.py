@@ -12,6 +12,7 @@ from safetensors.torch import load_file
 from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
 
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.training_bursts import open_bursts
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.checkpoint import load_checkpoint
@@ -107,6 +108,10 @@ def test_a_killed_run_goes_on_with_the_same_bits_and_further(tmp_path: Path, fil
     assert saved[0] is not None and saved[1] is not None and set(saved[0].tensors) == set(saved[1].tensors)
     for name, tensor in saved[0].tensors.items():  # of the network, of its mean and of Adam
         assert torch.equal(tensor, saved[1].tensors[name]), name
+    weights = tmp_path / "parts" / "matcher.safetensors"
+    weights.unlink()
+    run(MatchTraining(files, TINY, SETTINGS, 0), 6, key, tmp_path / "parts")
+    assert weights.read_bytes() == (tmp_path / "whole" / "matcher.safetensors").read_bytes()
 
 
 def test_weights_begin_a_training_at_their_step_with_a_warm_up(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]
@@ -121,6 +126,10 @@ def test_weights_begin_a_training_at_their_step_with_a_warm_up(tmp_path: Path, f
     training.train_step()
     assert training.adam.groups[0].lr == pytest.approx(SETTINGS.lr / SETTINGS.warm_up)
     assert (training.step, training.warm_steps) == (9, 1)
+    begun = MatchTraining(files[1:], TINY, SETTINGS, 0, weights)
+    with pytest.raises(UserError, match="--steps: expected more than the 8 steps of the weights .*, found 8"):
+        run(begun, 8, "third", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
     run(training, 10, "another", tmp_path / "on")
     assert (training.step, training.warm_steps) == (10, 2)
     card = WEIGHTS.read_card(tmp_path / "on" / "matcher.safetensors")
