@@ -66,11 +66,11 @@ def train_msdi(
         return _train_images((learned, hidden), config, start, steps, device, compute.seed, out)
     settings = TrainingSettings(steps=steps, views=views, lr_points=rate, warm_up=min(500, max(1, steps // 10)))
     training = Training(Bursts(learned), CONFIGS[config], settings, device, compute.seed)
-    earlier = start_from(training.network, start) if start else frozenset[str]()
-    key = checkpoint_key(settings, config, compute.seed, sha256_file(start) if start else None)
+    begun = start_from(training.network, start) if start else None
+    key = checkpoint_key(settings, config, compute.seed, begun.sha256 if begun else None)
     size = sum(p.numel() for p in training.network.parameters())
     print(f"{len(training.data)} bursts, {config}, {size / 1e6:.1f} M parameters, {training.device}", flush=True)
-    Run(training, hidden, key, out, earlier).run()
+    Run(training, hidden, key, out, begun).run()
     return 0
 
 

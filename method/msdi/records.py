@@ -6,19 +6,29 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
 from pathlib import Path
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.environment import harness
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, read_json, write_json, write_text
-from spike4dgs.benchmark.scene.training_bursts import BurstFile
+from spike4dgs.benchmark.scene.training_bursts import BurstFacts, BurstFile
 from spike4dgs.benchmark.variants import HIDDEN_VARIANTS
 from spike4dgs.method.msdi.config import CONFIGS
 from spike4dgs.method.msdi.losses import TrainingSettings
 from spike4dgs.method.msdi.weights import VARIABLE, Card
 
 Row = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class StartWeights:
+    """The weights that a training began with."""
+
+    name: str  # of the file
+    sha256: str
+    shards: Set[str] = frozenset()  # that they were trained on, as ID@SHA256
 
 
 class Curve:
@@ -128,15 +138,35 @@ _ROWS = {  # name in `evaluate` -> text of the card
 }
 
 
-def model_card(card: Card, settings: TrainingSettings, sha256: str) -> str:
-    """Return the text of the card, in Markdown; `sha256` is that of the weight file."""
+def data_commands(facts: Sequence[BurstFacts]) -> list[str]:
+    """Return the commands that make the training shards of these facts: one for all that have the same settings."""
+    worlds: dict[str, Counter[str]] = {}
+    for f in facts:
+        named = {"rigs": f.rigs, "instants": f.instants, "resting": f.resting, "width": f.width, "height": f.height}
+        settings = " ".join(f"--{name} {value}" for name, value in {**named, "spp": f.spp, "seed": f.seed}.items())
+        worlds.setdefault(settings, Counter())[f.world] += 1
+    return [
+        f"spike4dgs make-msdi-data {' '.join(sorted(found))} --variants {max(found.values())} {settings}"
+        for settings, found in sorted(worlds.items())
+    ]
+
+
+def model_card(
+    card: Card, settings: TrainingSettings, sha256: str, facts: Sequence[BurstFacts], start: StartWeights | None = None
+) -> str:
+    """Return the text of the card, in Markdown.
+
+    `sha256` is that of the weight file, `facts` those of the training shards.
+    """
     config = CONFIGS[card.config]
-    worlds = Counter(name.rpartition("@")[0].rpartition("-")[0] for name in card.trained_on)
+    worlds = Counter(name.rpartition("-")[0] for name in {name.rpartition("@")[0] for name in card.trained_on})
     variants = ", ".join(f"{world} ({count})" for world, count in sorted(worlds.items()))
-    rows = [f"| {text} | {card.measured[name]:g} |" for name, text in _ROWS.items() if name in card.measured]
-    numbers = ", ".join(map(str, HIDDEN_VARIANTS))
     command = f"spike4dgs train-msdi --config {card.config} --steps {settings.steps} --views {settings.views}"
     command += f" --rate {settings.lr_points:g} --seed {card.seed}"
+    command += f" --start {start.name}" if start else ""
+    most = min(settings.most_views, settings.views)
+    began = f"Begun with the weights `{start.name}`, sha256 `{start.sha256}`. " if start else ""
+    commands = "\n".join(f"  `{line}`," for line in data_commands(facts))
     return f"""# Model card: MSDI, configuration `{card.config}`
 
 MSDI takes {config.ticks} ticks of spikes of two or more cameras. It gives an image of each camera, the point that each
@@ -145,28 +175,19 @@ pixel sees in the first camera's frame, with a confidence, and, by PnP, the came
 Weights of step {card.steps}, as half floats, sha256 `{sha256}`.
 `{VARIABLE}=FILE` uses other weights of the same format.
 
-## Measured on hidden variants
-
-Variants {numbers} of each world, seen by rigs that were not used in training. Intrinsics are known, and so are the
-sensors unless a row says otherwise; up to {settings.most_views} views. A view without a pose counts as 180 degrees.
-Beside this card, `calibration.png` plots expected against true errors, and `curves.png` the training.
-
-| measured | value |
-|---|---|
-{chr(10).join(rows)}
-
-## Training
+{_measured(card, settings)}## Training
 
 - Data: bursts rendered by `make-msdi-data`; variants of each world: {variants}. Variants 0 to 9 are never rendered
   for training, nor is any world's own rig. Spikes are simulated anew at every use, with random sensors, brightness,
   views and direction of time, and mirrored half of the time.
 - Loss: L1 of radiance for extractor and generator, DUSt3R's confidence-weighted regression of points for the rest.
-- {card.steps} steps of {settings.views} views in all, 2 to {settings.most_views} of a sample; Adam at
+- {card.steps} steps of {settings.views} views in all, 2 to {most} of a sample; Adam at
   {settings.lr_points:g} ({settings.lr_images:g} for extractor and generator) after {settings.warm_up} steps of warm-up,
   falling to 0 with the cosine over {settings.steps} steps; gradients of both clipped at norm 1; seed {card.seed}. In
   {settings.unknown_share:.0%} of the steps the intrinsics are withheld, in {settings.raw_share:.0%} the sensors.
-- Commit {harness()["commit"] or "unknown"}. Commands:
-  `spike4dgs make-msdi-data --variants {max(worlds.values())}`, then `{command}`.
+- {began}Commit {harness()["commit"] or "unknown"}. Commands:
+{commands}
+  then `{command}`.
   On other machines the numbers differ in their last digits.
 
 ## Limits
@@ -176,4 +197,23 @@ Beside this card, `calibration.png` plots expected against true errors, and `cur
 - The training data contain one kind of sensor: gain, noise and spread between pixels are those of the simulated
   cameras.
 - Points have no absolute scale.
+"""
+
+
+def _measured(card: Card, settings: TrainingSettings) -> str:
+    """Return the part of the card that says how good the weights are; empty where there was nothing to score."""
+    rows = [f"| {text} | {card.measured[name]:g} |" for name, text in _ROWS.items() if name in card.measured]
+    if not rows:
+        return ""
+    numbers = ", ".join(map(str, HIDDEN_VARIANTS))
+    return f"""## Measured on hidden variants
+
+Variants {numbers} of each world, seen by rigs that were not used in training. Intrinsics are known, and so are the
+sensors unless a row says otherwise; up to {settings.most_views} views. A view without a pose counts as 180 degrees.
+Beside this card, `calibration.png` plots expected against true errors, and `curves.png` the training.
+
+| measured | value |
+|---|---|
+{chr(10).join(rows)}
+
 """

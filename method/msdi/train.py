@@ -11,7 +11,7 @@ with the bits of a run that never stopped.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Set
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from spike4dgs.benchmark.environment import device_type
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import sha256_json, write_text
+from spike4dgs.benchmark.files import sha256_file, sha256_json, write_text
 from spike4dgs.benchmark.scene.training_bursts import BurstFile, open_folder
 from spike4dgs.benchmark.variants import FIRST_SEASON_VARIANT, FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import read_tensors
@@ -34,7 +34,14 @@ from spike4dgs.method.msdi.evaluate import Scores, evaluate
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import TrainingSettings, image_loss, point_loss
 from spike4dgs.method.msdi.network import Msdi, has_bfloat16
-from spike4dgs.method.msdi.records import Curve, model_card, note_shards, plot_calibration, plot_curves
+from spike4dgs.method.msdi.records import (
+    Curve,
+    StartWeights,
+    model_card,
+    note_shards,
+    plot_calibration,
+    plot_curves,
+)
 from spike4dgs.method.msdi.training_data import Batch, Bursts, check_ticks
 from spike4dgs.method.msdi.weights import WEIGHTS, Card
 
@@ -73,7 +80,7 @@ class Training:
     def batch(self, step: int) -> Batch:
         """Return the batch of a step, a function of the seed and the step."""
         rng = np.random.default_rng([self.seed, step])
-        views = int(rng.integers(2, min(self.settings.most_views, self.data.views) + 1))
+        views = int(rng.integers(2, min(self.settings.most_views, self.settings.views, self.data.views) + 1))
         return self.data.draw(max(1, self.settings.views // views), views, self.network.config.ticks, rng)
 
     def train_step(self) -> StepLosses:
@@ -149,33 +156,30 @@ def checkpoint_key(settings: TrainingSettings, config: str, seed: int, start_sha
     return sha256_json([facts, config, seed, start_sha256])
 
 
-def start_from(network: Msdi, path: Path) -> Set[str]:
-    """Take the weights of an earlier training, or those of a file of Fast3R or DUSt3R, in place.
+def start_from(network: Msdi, path: Path) -> StartWeights:
+    """Take the weights of an earlier training, or those of a file of Fast3R or DUSt3R, in place; return their facts.
 
-    Return the shards that the earlier training saw, as ID@SHA256. Raises UserError for a damaged file and for the
-    weights of something else.
+    Raises UserError for a damaged file and for the weights of something else.
     """
     fix = "name a file that train-msdi wrote, or one of Fast3R or DUSt3R"
     state = read_tensors(path, "weights in safetensors format", fix)
     own = network.state_dict()
     if {n: t.shape for n, t in state.items()} == {n: t.shape for n, t in own.items()}:
         network.load_state_dict({name: tensor.float() for name, tensor in state.items()})
-        return frozenset(WEIGHTS.read_card(path).trained_on)
+        return StartWeights(path.name, sha256_file(path), frozenset(WEIGHTS.read_card(path).trained_on))
     transfer(network, state, path)
-    return frozenset()
+    return StartWeights(path.name, sha256_file(path))
 
 
 class Run:
-    """A training with its files in the folder `out`, continued from its checkpoint.
-
-    `earlier`: the shards that the weights it began with were trained on.
-    """
+    """A training with its files in the folder `out`, continued from its checkpoint."""
 
     def __init__(
-        self, training: Training, hidden: list[BurstFile], key: str, out: Path, earlier: Set[str] = frozenset()
+        self, training: Training, hidden: list[BurstFile], key: str, out: Path, start: StartWeights | None = None
     ) -> None:
-        self.training, self.key, self.out = training, key, out
+        self.training, self.key, self.out, self.start = training, key, out, start
         training.resume(self.checkpoint, key)
+        earlier = start.shards if start else frozenset[str]()
         self.seen = note_shards(out / "trained_on.json", training.data.files, earlier, fresh=training.step == 0)
         ticks, most = training.network.config.ticks, training.settings.most_views
         self.hidden = Bursts(hidden).fixed(_SCORED_BURSTS, most, ticks) if hidden else []
@@ -215,9 +219,7 @@ class Run:
     def export(self) -> None:
         """Score the weights as they are; write them, the curves and the model card."""
         training = self.training
-        scores = (
-            evaluate(training.network, self.hidden, training.device) if self.hidden else Scores({}, np.ones((1, 2)))
-        )
+        scores = evaluate(training.network, self.hidden, training.device) if self.hidden else Scores({}, None)
         measured = {name: round(value, 4) for name, value in scores.measured.items()}
         card = Card(training.network.config.name, training.step, training.seed, self.seen, measured)
         path = self.out / f"msdi-{card.config}.safetensors"
@@ -228,6 +230,7 @@ class Run:
         plot_curves(self.out / "curves.png", self.losses.rows, self.scores.rows)
         if scores.calibration is not None:
             plot_calibration(self.out / "calibration.png", scores.calibration)
-        write_text(self.out / "README.md", model_card(card, training.settings, digest))
+        facts = [f.facts for f in training.data.files]
+        write_text(self.out / "README.md", model_card(card, training.settings, digest, facts, self.start))
         shown = "".join(f", {n} {measured[n]:g}" for n in ("psnr_db", "tfp_psnr_db", "point_error") if n in measured)
         print(f"step {training.step}, written: {path}{shown}", flush=True)

@@ -10,24 +10,27 @@ import numpy as np
 import pytest
 import torch
 from toy_bursts import write_toy_shard
+from toy_world import GAIN
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.scene.training_bursts import open_folder
+from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.scene.training_bursts import BurstFacts, open_folder
 from spike4dgs.cli.options import Compute
 from spike4dgs.cli.train_msdi import train_msdi
 from spike4dgs.method.msdi import TINY, Estimate, Msdi
 from spike4dgs.method.msdi.evaluate import GROUPS, calibrate, evaluate, tfp
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import ALPHA
-from spike4dgs.method.msdi.records import Curve
+from spike4dgs.method.msdi.records import Curve, StartWeights, model_card
 from spike4dgs.method.msdi.train import (
+    Run,
     Training,
     TrainingSettings,
     checkpoint_key,
     start_from,
 )
 from spike4dgs.method.msdi.training_data import Batch, Bursts
-from spike4dgs.method.msdi.weights import WEIGHTS, load_network
+from spike4dgs.method.msdi.weights import WEIGHTS, Card, load_network
 
 FAST = TrainingSettings(steps=150, views=4, most_views=3, lr_points=4e-3, warm_up=10)
 
@@ -186,6 +189,33 @@ def test_curves_drop_rows_that_a_resumed_training_repeats(tmp_path: Path) -> Non
         Curve(tmp_path / "c.csv", 100)
 
 
+@pytest.mark.parametrize("views", [2, 4])
+def test_a_step_has_no_more_views_than_are_asked_for(data: Bursts, views: int) -> None:
+    training = Training(data, TINY, replace(FAST, views=views, most_views=8), "cpu", seed=0)
+    drawn = [training.batch(step).spikes.shape[:2] for step in range(12)]
+    assert max(samples * each for samples, each in drawn) <= views
+
+
+def test_without_hidden_shards_nothing_is_said_of_scores(data: Bursts, tmp_path: Path) -> None:
+    Run(Training(data, TINY, FAST, "cpu", seed=0), [], "key", tmp_path).export()
+    assert not (tmp_path / "calibration.png").exists()
+    text = (tmp_path / "README.md").read_text()
+    assert "Measured" not in text and "calibration.png" not in text and "\n\n## Training\n\n- Data" in text
+
+
+def test_the_card_counts_variants_and_names_what_began_the_training() -> None:
+    card = Card("tiny", 3, 0, ("car-13@0123", "car-13@4567", "car-14@89ab", "bird-13@cdef"), {})
+    facts = [BurstFacts(*own, 0, 104, 64, 9, 6, 3, 32, GAIN, 5e4, 12) for own in (("car", 13), ("car", 14))]
+    facts.append(replace(facts[0], world="bird", rigs=1, seed=7))
+    text = model_card(card, FAST, "ef01", facts, StartWeights("earlier.safetensors", "2345"))
+    assert "variants of each world: bird (1), car (2)." in text
+    assert "Begun with the weights `earlier.safetensors`, sha256 `2345`." in text
+    assert " --seed 0 --start earlier.safetensors`." in text
+    settings = "--instants 3 --resting 12 --width 104 --height 64 --spp 32"
+    assert f"`spike4dgs make-msdi-data car --variants 2 --rigs 6 {settings} --seed 0`" in text
+    assert f"`spike4dgs make-msdi-data bird --variants 1 --rigs 1 {settings} --seed 7`" in text
+
+
 # ---------------------------------------------------------------- command
 
 
@@ -217,6 +247,7 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
     write_toy_shard(tmp_path / "more", 15)
     begun = {**arguments, "data": tmp_path / "more", "out": tmp_path / "begun", "start": path}
     assert train_msdi(**begun) == 0  # type: ignore[arg-type]
+    assert f"`{path.name}`, sha256 `{sha256_file(path)}`" in (tmp_path / "begun/README.md").read_text()
     seen = WEIGHTS.read_card(tmp_path / "begun/msdi-tiny.safetensors").trained_on
     assert set(seen) > set(card.trained_on) and any(name.startswith("toy-15@") for name in seen)
 
