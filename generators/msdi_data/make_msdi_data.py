@@ -1,6 +1,6 @@
 """Training bursts of many variants of the worlds, seen by many rigs, at low resolution.
 
-The format of the shards is in `benchmark.scene.bursts`. A shard is a function of its settings alone.
+The format of the shards is in `benchmark.scene.training_bursts`. A shard is a function of its settings alone.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class MakeBursts:
         for _ in range(facts.rigs):
             renderer = self._renderer(world, rng, jittered_cameras)
             rigs.append([renderer.burst(tick, map_seed) for tick in _instants(facts.instants, rng)])
-            backgrounds.append((renderer.background, renderer.background_depth))
+            backgrounds.append((renderer.background, renderer.static_depths()))
         resting = [
             self._renderer(world, rng, wide_cameras).at_rest(_instants(1, rng)[0], map_seed)
             for _ in range(facts.resting)
@@ -102,8 +102,9 @@ class MakeBursts:
             cameras = draw(world, self.width, self.height, rng, amount)
             renderer = BurstRenderer(world, cameras, seed=int(rng.integers(1 << 31)), spp=self.spp)
             away = float(np.linalg.norm(cameras[VIEWS // 2].center - np.array(world.rig.target)))
-            near = np.quantile(renderer.background_depth, 0.02, axis=(1, 2), method="lower")
-            seen = np.isfinite(renderer.background_depth).mean(axis=(1, 2))
+            depths = renderer.static_depths()
+            near = np.quantile(depths, 0.02, axis=(1, 2), method="lower")
+            seen = np.isfinite(depths).mean(axis=(1, 2))
             if amount < 0.1 or (near.min() > _NEAREST * away and seen.min() > _LEAST_SEEN):
                 return renderer
             amount *= 0.8

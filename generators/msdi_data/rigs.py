@@ -112,13 +112,6 @@ class BurstRenderer(Visibility):
         every = np.arange(int(np.prod(self.shape)))
         return self._radiance(every, BACKGROUND_SAMPLES * self.spp, moving=False).reshape(self.shape)
 
-    @cached_property
-    def background_depth(self) -> Float32:
-        """Depth [V, H, W] of the static surfaces along the optical axes, metres; inf: no surface."""
-        forward = np.stack([c.R[2] for c in self.cameras])  # [V, 3]
-        cosine = (self._rays[1].reshape(*self.shape, 3) * forward[:, None, None]).sum(-1)
-        return (self._static_hits[0].reshape(self.shape) * cosine).astype(np.float32)
-
     def burst(self, tick: int, map_seed: int) -> Burst:
         """Return the burst around the start of `tick` with maps of `map_seed`; `tick` is REACH from the clip's ends."""
         now, reach = tick / RATE_HZ, REACH / RATE_HZ

@@ -27,13 +27,6 @@ class CellDepths:
     confidence: Float32  # [h, w] in 0..1; 0 where fewer than two views see the point
 
 
-def planes_of(inverse_depth: Float64, count: int, margin: float = 0.15) -> Float64:
-    """Return `count` inverse depths that enclose those of points [N], but for a hundredth on either side."""
-    low, high = np.quantile(inverse_depth[inverse_depth > 0], [0.01, 0.99])
-    span = margin * (high - low)
-    return np.linspace(max(low - span, 0.05 * low), high + span, count)
-
-
 @torch.inference_mode()
 def cell_depths(fine: Tensor, array: Array, view: int, planes: Float64) -> CellDepths:
     """Return the depths of a view's cells; `fine` [V, F, h, w] features, cells of FINE px, `planes` [D] rising."""

@@ -42,7 +42,6 @@ class Solved:
     array: Array
     tracks: Tracks
     adjusted: Adjusted
-    began: str  # "pairs" or "plane"
 
     def points_kept(self) -> Int64:
         """Return the numbers of the tracks that two views or more see in front of them, within `CERTAIN` errors."""
@@ -81,20 +80,20 @@ def _best(
     views = len(intrinsics[0])
     if not _all_seen(few, views):
         return None
-    first: list[tuple[float, str, Array]] = []
+    first: list[tuple[float, Array]] = []
     for K in intrinsics:
-        for name, array in _beginnings(matches, K, seed, settings):
+        for array in _beginnings(matches, K, seed, settings):
             found = adjust(array, few, focal=focal)
             if np.isfinite(found.cost):
-                first.append((found.cost, name, found.array))
+                first.append((found.cost, found.array))
     if not first:
         return None
-    _, name, array = min(first, key=lambda x: x[0])
+    _, array = min(first, key=lambda x: x[0])
     found = adjust(array, many, focal=focal)
     kept = many.where(found.errors < settings.believed)
     if _all_seen(kept, views):
         many, found = kept, adjust(found.array, kept, focal=focal, rounds=2)
-    return Solved(found.array, many, found, name)
+    return Solved(found.array, many, found)
 
 
 def _all_seen(tracks: Tracks, views: int) -> bool:
@@ -102,12 +101,12 @@ def _all_seen(tracks: Tracks, views: int) -> bool:
     return bool((seen >= LEAST_POINTS).all())
 
 
-def _beginnings(matches: Matches, K: Float64, seed: int, settings: SolveSettings) -> Iterator[tuple[str, Array]]:
+def _beginnings(matches: Matches, K: Float64, seed: int, settings: SolveSettings) -> Iterator[Array]:
     pairs = relative_poses(matches, K, settings.reach_px)
     if pairs and (found := averaged(pairs, len(K))):
-        yield "pairs", Array(*found, K)
+        yield Array(*found, K)
     if array := from_plane(matches, K, seed, settings):
-        yield "plane", array
+        yield array
 
 
 def from_plane(matches: Matches, K: Float64, seed: int, settings: SolveSettings = DEFAULTS) -> Array | None:

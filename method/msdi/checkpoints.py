@@ -23,7 +23,6 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.weights import read_tensors
 from spike4dgs.method.msdi.network import Msdi
 
 _FIX = "use model.safetensors of jedyang97/Fast3R_ViT_Large_512 or naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt"
@@ -64,7 +63,7 @@ _HEAD_NAMES = (
 
 
 def canonical_head(name: str) -> str:
-    """Return the name that `dpt.Dpt` uses for a head's layer, from either of its published names."""
+    """Return the name that `layers.Dpt` uses for a head's layer, from either of its published names."""
     for pattern, ours in _HEAD_NAMES:
         name = pattern.sub(lambda m, ours=ours: ours.format(int(m[1]) - 1), name)  # type: ignore[misc]
     return name
@@ -93,16 +92,11 @@ def renamed(state: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tensor]
     return ours, tuple(left)
 
 
-def load_pretrained(network: Msdi, path: Path) -> Transfer:
-    """Take the tensors of a file of Fast3R or DUSt3R for `network`, in place, and return which were taken.
-
-    Raises UserError where the file is neither's, is damaged, or is of other sizes than the network.
-    """
-    return transfer(network, read_tensors(path, "weights in safetensors format", _FIX), path)
-
-
 def transfer(network: Msdi, state: Mapping[str, Tensor], path: Path) -> Transfer:
-    """Take a state dict as `load_pretrained` does; `path` is for the error."""
+    """Take a state dict of Fast3R or DUSt3R for `network`, in place, and return what was taken.
+
+    `path` is for the error. Raises UserError where the tensors are neither's, or of other sizes than the network's.
+    """
     source = source_of(state)
     if source is None:
         raise problem(path, "the tensors of Fast3R or DUSt3R", f"others, such as {min(state, default='none')}", _FIX)

@@ -2,8 +2,9 @@
 
 The windows of the clip are compared with its middle one. There every view's depths come from the plane sweep, so a path
 (`array_path`) says where each of its pixels is in any other window. The path is fitted for which the pixels keep their
-values, all cameras and windows together, by Gauss-Newton with Cauchy's weights: things that move by themselves are
-explained by no path and lose theirs. Windows are added outwards from the middle, where the path so far foretells them.
+values, all cameras and windows together, by Gauss-Newton with Geman and McClure's weights: things that move by
+themselves are explained by no path and lose theirs. Windows are added outwards from the middle, where the path so far
+foretells them.
 
 A path is believed where it explains most of what changes as far as noise goes, and moves the image by more than a part
 of a pixel. Else the array stands still. (What falls or flies together follows a path too, but not to the noise.)

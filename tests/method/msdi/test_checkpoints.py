@@ -17,7 +17,8 @@ from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi import PAPER, TINY, Msdi, MsdiConfig
-from spike4dgs.method.msdi.checkpoints import load_pretrained, source_of, transfer
+from spike4dgs.method.msdi.checkpoints import source_of, transfer
+from spike4dgs.method.msdi.train import start_from
 from spike4dgs.method.msdi.weights import SHIPPED, WEIGHTS, Card, load_network
 
 EMBED = replace(TINY, embed_channels=3)  # as the published patch embedding
@@ -114,11 +115,10 @@ def test_the_papers_configuration_takes_dust3rs_encoder() -> None:
     assert {n.split(".")[0] for n in result.fresh} == {"encoder", "extractor", "fusion", "generator", "head"}
 
 
-def test_values_have_the_right_names(tmp_path: Path) -> None:
+def test_values_have_the_right_names() -> None:
     state = random_state(fast3r_shapes(EMBED), 1)
-    save_file(state, tmp_path / "model.safetensors")
     network, before = fresh(EMBED), fresh(EMBED).state_dict()
-    result = load_pretrained(network, tmp_path / "model.safetensors")
+    result = transfer(network, state, Path("model.safetensors"))
     after = network.state_dict()
     for ours, theirs in {
         "encoder.patch_embed.weight": "encoder.patch_embed.proj.weight",
@@ -141,12 +141,11 @@ def test_values_have_the_right_names(tmp_path: Path) -> None:
     assert out.points.isfinite().all()
 
 
-def test_dust3rs_encoder_gives_the_same_tokens_here(tmp_path: Path) -> None:
+def test_dust3rs_encoder_gives_the_same_tokens_here() -> None:
     torch.manual_seed(4)
     published = Dust3r(DUST3R).eval()
-    save_file({k: v.clone() for k, v in published.state_dict().items()}, tmp_path / "model.safetensors")
     network = fresh(EMBED)
-    load_pretrained(network, tmp_path / "model.safetensors")
+    transfer(network, published.state_dict(), Path("model.safetensors"))
     images = torch.randn(2, 3, 32, 48)
     features = torch.cat([images, torch.randn(2, EMBED.features - 3, 32, 48)], dim=1)
     with torch.no_grad():
@@ -161,23 +160,23 @@ def test_other_files_are_refused_and_nothing_is_unpickled(tmp_path: Path) -> Non
     before = {k: v.clone() for k, v in network.state_dict().items()}
     torch.save({"model": {}}, path)
     with pytest.raises(UserError, match="expected weights in safetensors format"):
-        load_pretrained(network, path)
+        start_from(network, path)
     with pytest.raises(UserError, match="expected weights in safetensors format"):
-        load_pretrained(network, tmp_path / "absent.safetensors")
+        start_from(network, tmp_path / "absent.safetensors")
     save_file({"weight": torch.zeros(1)}, path)
     with pytest.raises(UserError, match="the tensors of Fast3R or DUSt3R, found others, such as weight"):
-        load_pretrained(network, path)
+        start_from(network, path)
     state = random_state(fast3r_shapes(EMBED), 0)
     del state["encoder.enc_norm.bias"]
     save_file(state, path)
     with pytest.raises(UserError, match="found 1 other tensors, the first encoder.norm.bias missing"):
-        load_pretrained(network, path)
+        start_from(network, path)
     save_file(random_state(fast3r_shapes(replace(EMBED, fusion_layers=5)), 0), path)
     with pytest.raises(UserError, match=r"found 12 other tensors, the first fusion.blocks.4.attn.proj.bias \(16,\)"):
-        load_pretrained(network, path)
+        start_from(network, path)
     save_file(random_state(fast3r_shapes(EMBED), 0), path)
     with pytest.raises(UserError, match="encoder.patch_embed.weight"):
-        load_pretrained(fresh(TINY), path)  # embeds four channels
+        start_from(fresh(TINY), path)  # embeds four channels
     assert all(torch.equal(v, before[k]) for k, v in network.state_dict().items())
     assert source_of({}) is None
 
