@@ -101,7 +101,7 @@ def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) 
     if flat_field and scene.calibrations:
         means = np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
     else:
-        means = rates / white_rates(scene).astype(np.float32)
+        means = np.asarray(rates / white_rates(scene).astype(np.float32), np.float32)
     return undistorted(scene, means, unseen=None)
 
 

@@ -107,7 +107,8 @@ def infer(
     with torch.inference_mode():
         found = network(small.to(device), K.to(device) if calibrated else None, sensors)
     rates = zip(found.images[0].clamp(min=0).cpu().numpy(), scene.streams, strict=True)
-    images = np.stack([gathered(image, stream.dead_ticks) for image, stream in rates]) / gain.astype(np.float32)
+    charge = np.stack([gathered(image, stream.dead_ticks) for image, stream in rates])
+    images = np.asarray(charge / gain.astype(np.float32), np.float32)
     points, confidence = (x[0].double().cpu().numpy() for x in (found.points, found.confidence))
     return Estimate(factor, cameras, images, points, confidence)
 
