@@ -24,6 +24,7 @@ from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
 from spike4dgs.generators.recorder.rig_calibration.initial_rig import estimate_rig
 
 WORST_PX, MOST_LEFT_OUT = 1.0, 0.25  # limits of reprojection error and of rejected corners; beyond, the fit has failed
+WORST_FOCAL = 0.03  # limit of a focal length's standard deviation; a well tilted board leaves 0.005 at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,8 @@ def calibrate_array(
 ) -> ArrayCalibration:
     """Return intrinsics and poses from detections; corners that do not fit are left out. `size`: width, height.
 
-    Raises UserError where a camera has too few detections, or where no array of pinholes explains them.
+    Raises UserError where a camera has too few detections, where no array of pinholes explains them, or where they
+    leave a focal length open.
     """
     points = board.corners
     initial, reference = estimate_rig(detections, points, names, size)
@@ -70,6 +72,12 @@ def calibrate_array(
         fix = "check that all cameras share one clock and one orientation (`rows`, `mirrored`), and --columns, --rows"
         named = f"; other cameras than {', '.join(wrong)} agree" if 0 < len(wrong) < len(names) else ""
         raise problem("array", expected, f"{error:.2f} px with {1 - left_out:.0%} of them{named}", fix)
+    focal = found.rig.focal
+    unknown = np.where(focal > 0, found.focal_px / focal, np.inf)
+    if not unknown.max() < WORST_FOCAL:
+        expected = f"focal lengths to {WORST_FOCAL:.0%}, one standard deviation"
+        fix = "tilt the board to all sides by 20 to 40 degrees, or add --shared-focal or --centered if that is so"
+        raise problem("array", expected, f"{unknown.max():.1%} for {names[int(unknown.argmax())]}", fix)
     return ArrayCalibration(levelled(found.rig, names, size), found, used, reference, error, each)
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from spike4dgs.benchmark.arrays import Float64, Int64, Mask
 
-_MOST_STEPS = 60
+_MOST_STEPS = 300  # where the board leaves much open, the way is long
 _CONVERGED = 1e-9  # relative decrease of the sum of squares of a last step
 _FINEST_PX = 1e-3  # the accuracy of corners is never better
 _PER_CAMERA = 9  # w, v, focal length, principal point
@@ -126,8 +126,7 @@ def adjust(
         if converged:
             break
     variance = cost / max(2 * int(detections.used.sum()) - columns.n, 1)
-    covariance = np.asarray(variance * np.linalg.pinv(H, hermitian=True), np.float64)
-    return Adjusted(rig, math.sqrt(variance), *_deviations(covariance, columns))
+    return Adjusted(rig, math.sqrt(variance), *_deviations(variance * _diagonal_of_inverse(H), columns))
 
 
 def trimmed(rig: Rig, detections: Detections, points: Float64, sigmas: float = 4.0) -> Detections:
@@ -232,11 +231,22 @@ def _nudged(R: Float64, t: Float64, motion: Float64) -> tuple[Float64, Float64]:
     return turn @ R, np.einsum("nij,nj->ni", turn, t) + motion[:, 3:]
 
 
-def _deviations(covariance: Float64, columns: _Columns) -> tuple[Float64, Float64, Float64]:
+def _diagonal_of_inverse(H: Float64) -> Float64:
+    """Return the diagonal [P] of the inverse of a normal matrix: very large where the data determine nothing.
+
+    Its units differ, metres from pixels by orders of magnitude, so its eigenvalues compare only at a unit diagonal.
+    """
+    own = np.diag(H)
+    scale = 1 / np.sqrt(np.where(own > 0, own, 1.0))
+    values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
+    return np.asarray(scale**2 * (vectors**2 @ (1 / np.maximum(values, np.finfo(float).eps))), np.float64)
+
+
+def _deviations(variances: Float64, columns: _Columns) -> tuple[Float64, Float64, Float64]:
     """Return standard deviations of centres (-R^T v, as far as v moves them), rotations in degrees, and focal lengths.
 
     They are 0 for known values.
     """
-    variance = np.where(columns.camera >= 0, np.diag(covariance)[columns.camera], 0.0)
+    variance = np.where(columns.camera >= 0, variances[columns.camera], 0.0)
     turn, center = np.sqrt(variance[:, :3].sum(axis=1)), np.sqrt(variance[:, 3:6].sum(axis=1))
     return center, np.degrees(turn), np.sqrt(variance[:, 6])

@@ -194,3 +194,21 @@ def test_an_array_that_no_pinholes_explain_is_refused():
         array_calibration.calibrate_array(
             replace(detections, uv=late), BOARD, [c.id for c in cameras], (WIDTH, HEIGHT), Freedom()
         )
+
+
+def test_a_board_that_is_hardly_tilted_leaves_the_focal_length_open():
+    """Of a board parallel to the image, only the ratio of focal length and distance is known."""
+    rng, focal, size, views = np.random.default_rng(0), 600.0, (400, 250), 12
+    turns = Rotation.from_euler("xyz", rng.uniform(-1, 1, (views, 3)) * [1, 1, 20], degrees=True).as_matrix()
+    places = rng.uniform([-0.05, -0.05, 1.3], [0.05, 0.05, 1.7], (views, 3))
+    first = BOARD.corners @ turns.transpose(0, 2, 1) + places[:, None]
+    second = first @ Rotation.from_euler("y", 5, degrees=True).as_matrix() - [0.12, 0, 0]
+    x = np.concatenate([first, second])
+    uv = focal * x[..., :2] / x[..., 2:] + np.array(size) / 2 + 0.05 * rng.normal(size=(*x.shape[:2], 2))
+    camera, view = np.repeat([0, 1], views), np.tile(np.arange(views), 2)
+    detections = Detections(camera, view, uv, np.ones(uv.shape[:2], bool))
+    rig, reference = estimate_rig(detections, BOARD.corners, ["a", "b"], size)
+    found = adjust(rig, detections, BOARD.corners, reference)
+    assert (np.abs(found.rig.focal - focal) < 4 * found.focal_px).all()
+    with pytest.raises(UserError, match=r"focal lengths to 3%.* for [ab]; tilt the board"):
+        array_calibration.calibrate_array(detections, BOARD, ["a", "b"], size, Freedom())
