@@ -33,7 +33,7 @@ OPEN, ARMED, TRIGGERED, DRAIN, CLOSED = ("OPEN", "ARMED", "TRIGGERED", "DRAIN", 
 _POLL_S = 0.005  # interval at which this thread checks the others
 # Counters set by one trigger differ by what a camera sends before the last one is started; others differ by anything.
 _SKEW_S = 0.1
-_SPARE_SLOTS = 8  # each short read takes a whole slot
+_SPARE_SLOTS = 8  # of short reads, which fill none: with more of them their blocks are copied
 
 
 def capture(
@@ -98,7 +98,7 @@ class _Capture:
         self.links = {c.id: links[c.id] for c in sorted(profile.cameras, key=_primary) if c.id in links}
         self.restart = all(link.restartable for link in links.values())
         slots = _slots(profile, self.layout, n_ticks, continuous=sink is not None)
-        self.rings = {camera: Ring(slots, profile.transfer_bytes) for camera in self.links}
+        self.rings = {camera: Ring(slots, profile.transfer_bytes, compact=sink is None) for camera in self.links}
         self.readers: dict[str, Reader] = {}
         self.cutters: dict[str, Cutter] = {}
         self.delivery: Delivery | None = None

@@ -35,7 +35,7 @@ class Cutter:
         runs: list[Run] = []
         group: list[Block] = []  # adjacent in the stream and in memory
         for block in [*blocks, None]:
-            if group and (block is None or block.data is None or _address(block) != _end(group[-1])):
+            if group and (block is None or block.data is None or not _adjacent(group[-1], block)):
                 runs += self._feed(group)
                 group = []
             if block is not None and block.data is None:
@@ -54,10 +54,13 @@ class Cutter:
         return np.array(self._arrival, np.int64).reshape(-1, 2)
 
     def _feed(self, group: list[Block]) -> list[Run]:
-        begin, end = _address(group[0]) - self._base, _end(group[-1]) - self._base
-        drop = min(self._lead, end - begin)
+        data = group[0].data
+        if len(group) > 1:
+            data = self._flat[_address(group[0]) - self._base : _end(group[-1]) - self._base]
+        assert data is not None
+        drop = min(self._lead, len(data))
         self._lead -= drop
-        runs = self._counter.feed(self._flat[begin + drop : end])
+        runs = self._counter.feed(data[drop:])
         ends = np.array([_end(b) for b in group])
         complete = np.full(len(group), -1)
         for run in runs:
@@ -115,6 +118,12 @@ def joined(runs: Sequence[Run], n_ticks: int, frame_bytes: int) -> tuple[UInt8, 
         return cut[0][1], ticks[0]
     empty = np.empty((0, frame_bytes), np.uint8), np.empty(0, np.int64)
     return np.concatenate([empty[0], *(f for _, f in cut)]), np.concatenate([empty[1], *ticks])
+
+
+def _adjacent(block: Block, following: Block) -> bool:
+    """Return whether one block follows another in the ring's memory; copies of short reads are apart."""
+    views = [b.data is not None and b.data.base is not None for b in (block, following)]
+    return all(views) and _address(following) == _end(block)
 
 
 def _address(block: Block) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ _SPARE = -1
 class Block:
     """The data of one read: bytes [position, position + bytes) of the camera's stream. `data` is None if dropped."""
 
-    data: UInt8 | None  # [bytes], a view of the ring
+    data: UInt8 | None  # [bytes], a view of the ring, or a copy of a short read
     position: int
     bytes: int
     arrival_ns: int
@@ -32,10 +32,13 @@ class Ring:
 
     The filling thread calls `take` for each read it queues and `put` for each that ended; the emptying thread calls
     `pop`, and `release` when it no longer needs the blocks.
+
+    With `compact` blocks are never popped. Where no slot is free, the block of a short read is copied, which frees the
+    slot that it does not fill: however many reads are short, the ring holds as many bytes.
     """
 
-    def __init__(self, slots: int, slot_bytes: int) -> None:
-        self.slots, self.slot_bytes = slots, slot_bytes
+    def __init__(self, slots: int, slot_bytes: int, compact: bool = False) -> None:
+        self.slots, self.slot_bytes, self._compact = slots, slot_bytes, compact
         self.memory = np.empty((slots + 1, slot_bytes), np.uint8)  # the last row is the spare buffer
         self.memory.fill(0)  # makes the system map the pages now, not while the camera sends
         self._lock = threading.Lock()
@@ -49,16 +52,16 @@ class Ring:
         self.backlog = 0  # most that waited at once
         self._flying: deque[int] = deque()
         self._filled: deque[tuple[int, Block]] = deque()
-        self._next = self._used = 0  # used: in flight, waiting, or popped
-        self._popped = 0  # slots of the blocks that were popped last
+        self._short: deque[int] = deque()  # of the filled ones, those that may be copied
+        self._free = deque(range(self.slots))  # neither in flight nor waiting nor popped
+        self._popped: list[int] = []  # slots of the blocks that were popped last
 
     def take(self) -> UInt8:
         """Return the buffer [slot_bytes] for the next read: a free slot, or the spare one."""
         with self._lock:
-            slot = self._next if self._used < self.slots else _SPARE
-            if slot != _SPARE:
-                self._next = (slot + 1) % self.slots
-                self._used += 1
+            if not self._free and self._short:
+                self._copy(self._short.popleft())
+            slot = self._free.popleft() if self._free else _SPARE
         self._flying.append(slot)
         return self.memory[slot]
 
@@ -71,11 +74,13 @@ class Ring:
         if keep:
             self.dropped += n if data is None else 0
             with self._lock:
+                if self._compact and slot != _SPARE and n < self.slot_bytes:
+                    self._short.append(len(self._filled))
                 self._filled.append((slot, block))
                 self.waiting += slot != _SPARE
                 self.backlog = max(self.backlog, self.waiting)
         elif slot != _SPARE:
-            self._free()
+            self._release([slot])
         return block
 
     def pop(self, most: int) -> list[Block]:
@@ -83,21 +88,27 @@ class Ring:
         self.release()
         with self._lock:
             taken = [self._filled.popleft() for _ in range(min(most, len(self._filled)))]
-            self._popped = sum(slot != _SPARE for slot, _ in taken)
-            self.waiting -= self._popped
+            self._popped = [slot for slot, _ in taken if slot != _SPARE]
+            self.waiting -= len(self._popped)
         return [block for _, block in taken]
 
     def release(self) -> None:
         """Release the popped blocks' slots for further reads."""
-        if self._popped:
-            self._free(self._popped)
-        self._popped = 0
+        self._release(self._popped)
+        self._popped = []
 
     def blocks(self) -> list[Block]:
         """Return every waiting block, oldest first; they keep waiting."""
         with self._lock:
             return [block for _, block in self._filled]
 
-    def _free(self, slots: int = 1) -> None:
+    def _copy(self, k: int) -> None:
+        """Replace filled block `k` by a copy, and free its slot."""
+        slot, block = self._filled[k]
+        self._filled[k] = _SPARE, replace(block, data=self.memory[slot, : block.bytes].copy())
+        self._free.append(slot)
+        self.waiting -= 1
+
+    def _release(self, slots: list[int]) -> None:
         with self._lock:
-            self._used -= slots
+            self._free.extend(slots)

@@ -17,7 +17,7 @@ from spike4dgs.generators.recorder.frames.cutting import agree
 from spike4dgs.generators.recorder.frames.layouts import COUNTER
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.sync import Rate
-from spike4dgs.generators.recorder.usb.reads import UNPLUGGED
+from spike4dgs.generators.recorder.usb.reads import SHORT, UNPLUGGED
 
 N = 200  # ticks of most clips
 SECONDS = N / 20000
@@ -121,6 +121,20 @@ def test_ctrl_c_is_an_interruption_and_not_an_error() -> None:
     assert clip.interrupted and clip.complete and clip.n_ticks == 4096 // 30 and fastest > 0
     check_frames(clip.cameras[0], frames[0], clip.n_ticks)
     assert links["cam_00"].log[-1].startswith("close")
+
+
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
+def test_short_reads_between_frames_cost_no_memory_and_so_no_tick(layout: str) -> None:
+    """Each second frame ends a read: far more reads than the memory has room for whole ones."""
+    profile, frames, links = make(2, layout)
+    size = layout_of(profile).frame_bytes
+    for link in links.values():
+        link.faults = {size * tick: SHORT for tick in range(2, N, 2)}
+    clip = capture(profile, links, SECONDS)
+    assert clip.complete and clip.n_ticks == N
+    for camera, source in zip(clip.cameras, frames, strict=True):
+        assert camera.stats.short_reads > N // 3
+        check_frames(camera, source, N)
 
 
 def test_a_camera_that_sends_nothing_is_no_array() -> None:
