@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import usb1
@@ -52,14 +52,20 @@ def find_cameras(profile: RigProfile, ports: Sequence[Port]) -> dict[str, Port]:
 
 
 def check_machine(
-    profile: RigProfile, seconds: float, out: Path, *, continuous: bool = False, emulated: bool = False
+    profile: RigProfile,
+    seconds: float,
+    out: Path,
+    *,
+    continuous: bool = False,
+    emulated: bool = False,
+    copied: Collection[Path] = (),
 ) -> list[UserError]:
     """Return what this machine lacks to record `seconds` into the folder `out`, each as an error that states a fix.
 
-    Emulated cameras need no kernel memory for USB.
+    Emulated cameras need no kernel memory for USB. `copied`: files that go there too, besides the profile's maps.
     """
     found = [] if emulated else [check_usb_memory(profile)]
-    found += [check_memory(profile, seconds, continuous), check_disk(profile, seconds, out)]
+    found += [check_memory(profile, seconds, continuous), check_disk(profile, seconds, out, copied)]
     if continuous:
         found.append(check_ring(profile))
     return [p for p in found if p is not None]
@@ -96,10 +102,12 @@ def check_memory(profile: RigProfile, seconds: float, continuous: bool, free: in
     return problem("memory", f"{need / 1e9:.1f} GB for the rings", f"{free / 1e9:.1f} GB free", fix)
 
 
-def check_disk(profile: RigProfile, seconds: float, out: Path) -> UserError | None:
-    """Check the disk space for the packed streams of all cameras and a margin."""
+def check_disk(profile: RigProfile, seconds: float, out: Path, copied: Collection[Path] = ()) -> UserError | None:
+    """Check the disk space for the packed streams of all cameras, what is copied beside them, and a margin."""
     layout = make_layout(profile.layout, profile.width, profile.height)
+    maps = [c.maps for c in profile.cameras if c.maps] if profile.calibrated else []
     need = len(profile.cameras) * seconds * profile.fps * layout.payload_bytes + (16 << 20)
+    need += sum(path.stat().st_size for path in (*maps, *copied))
     folder = next(p for p in (out, *out.resolve().parents) if p.exists())
     free = shutil.disk_usage(folder).free
     if free >= need:

@@ -120,7 +120,9 @@ def record(
         raise problem("--seconds", expected, f"{length:g}", "record for longer, or shorter")
     n_ticks = round(length * profile.fps)
     profile = _with_buffer(profile, streaming, length)
-    if problems := check_machine(profile, length, out, continuous=continuous, emulated=emulation.emulate is not None):
+    copied = (truth(source.scene, n_ticks) | known).files.values()
+    emulated = emulation.emulate is not None
+    if problems := check_machine(profile, length, out, continuous=continuous, emulated=emulated, copied=copied):
         raise UserError("; ".join(map(str, problems)))
     with StreamFiles(out, profile, n_ticks) as files, _interruptible() as stop:
         links = open_links(profile, usb_ports() if source.ports is None else source.ports)

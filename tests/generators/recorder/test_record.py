@@ -7,6 +7,7 @@ import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -224,3 +225,13 @@ def test_all_that_the_machine_lacks_is_reported_at_once(scene, tmp_path, monkeyp
     monkeypatch.setattr(command, "check_machine", lambda *a, **k: lacks)
     assert record("--emulate", scene, "--out", tmp_path / "x") == 2
     assert "free some; memory: expected more, found less; buy some" in capsys.readouterr().err
+
+
+def test_the_disk_has_room_for_the_truth_beside_the_streams(scene, tmp_path, monkeypatch, capsys):
+    source = open_scene(scene)
+    streams = sum((scene / name).stat().st_size for name in source.manifest.files if name.startswith("spikes/"))
+    free = SimpleNamespace(free=streams + (16 << 20))  # the margin is not for the truth
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: free)
+    assert record("--emulate", scene, "--out", tmp_path / "x") == 2
+    assert "GB of free disk space" in capsys.readouterr().err and not (tmp_path / "x").exists()
+    assert record("--emulate", scene, "--out", tmp_path / "dark", "--mode", "dark", "--seconds", "0.004") == 0
