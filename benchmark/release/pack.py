@@ -20,6 +20,7 @@ from spike4dgs.benchmark.files import (
     check_new,
     locked,
     read_json,
+    remove_parts,
     sha256_file,
     write_bytes,
     write_json,
@@ -81,6 +82,7 @@ def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int, flat: 
         folders = ["" if flat else f"shards/{i // _SHARDS_PER_FOLDER:03d}/" for i in range(len(shards))]
         names = [f"{folder}{index.SHARD}{name}-{i:05d}.tar" for i, folder in enumerate(folders)]
         _refuse_others(out, [*names, *map(index_of, names)])
+        remove_parts(out)
         total = sum(file.bytes for sample in samples for file in sample.files)
         written = []
         with ByteProgress("packing", total) as progress:
