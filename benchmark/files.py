@@ -240,9 +240,11 @@ def visible(folder: Path, pattern: str) -> list[Path]:
 def remove_parts(folder: Path) -> None:
     """Remove what killed processes left half written in a folder and below it. The caller holds the folder's lock.
 
-    A fit's process, which ends after its caller was killed, may remove folders meanwhile: `Path.rglob` would raise.
+    Folders below it with a `.lock` of their own belong to other runs, which may be writing. A fit's process, which ends
+    after its caller was killed, may remove folders meanwhile: `Path.rglob` would raise.
     """
-    for inside, _, names in os.walk(folder):
+    for inside, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not Path(inside, name, ".lock").exists()]
         for path in (Path(inside, name) for name in names if _PART.fullmatch(name)):
             if path.is_file():
                 path.unlink(missing_ok=True)

@@ -192,8 +192,9 @@ def test_a_lock_that_is_a_fifo_is_an_error_and_no_wait(tmp_path: Path) -> None:
 def test_parts_of_killed_processes_are_removed_and_nothing_else(tmp_path: Path) -> None:
     gone = [".a.123.part.json", ".a.9.part.json.mode", "deeper/.b.7.part", "deeper/.cam_00.dat.99.part"]
     kept = [".a.part", ".car.json", "a.123.part.json", ".lock", "deeper/cam_00.dat", ".parts/x.png"]
+    kept += ["corner/.lock", "corner/.live.8.part.json", "corner/results/.live.8.part.json"]  # of another run
     for name in gone + kept:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     remove_parts(tmp_path)
     assert sorted(p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()) == sorted(kept)
