@@ -24,7 +24,7 @@ from spike4dgs.method.images.clip_images import ClipImages, clip_video, write_cl
 
 _WHITE = 99  # percentile of the pixels' rates that is shown white, where nothing says what white is
 _MOST_FPS = 1000.0
-_GATHERING = ("adaptive", "intervals")  # makers that hold the spike trains of a clip
+_GATHERING = ("adaptive", "intervals", "msdi")  # makers that hold the spike trains of a clip
 
 
 def images(

@@ -201,7 +201,7 @@ def test_a_network_without_weights_says_what_it_needs(
     )
 
 
-@pytest.mark.parametrize("method", ["adaptive", "intervals", "tfi"])
+@pytest.mark.parametrize("method", ["adaptive", "intervals", "msdi", "tfi"])
 def test_a_clip_whose_spikes_do_not_fit_into_memory(
     dat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:
