@@ -26,7 +26,7 @@ def import_dat(
     With `cameras` (COLMAP, OpenCV, Kalibr) it is a scene, else a folder of streams. Raises UserError before anything is
     written where files or cameras do not fit.
     """
-    recording.check()
+    recording.check("--cameras", cameras)
     if max(width, height) > MAX_SIDE:
         raise problem("--width and --height", f"at most {MAX_SIDE}", f"{width}, {height}", "correct it")
     files = {file.stem: file for file in _dat_files(path)}

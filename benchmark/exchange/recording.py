@@ -20,9 +20,10 @@ class Recording:
 
     Args:
         rate_hz: Ticks per second.
-        radiance_gain: Spikes per tick of a pixel at radiance 1 (white). With 1, radiance is in spikes per tick.
+        radiance_gain: Of a scene, spikes per tick of a pixel at radiance 1 (white). With 1, radiance is in spikes per
+            tick.
         rows_top_down: The files store the top row first. The usual order of this camera is bottom row first.
-        licence: Licence of the recording.
+        licence: Licence of a scene.
     """
 
     rate_hz: float
@@ -30,11 +31,15 @@ class Recording:
     rows_top_down: bool = False
     licence: str = "unknown"
 
-    def check(self) -> None:
-        """Raise UserError for numbers that no recording has."""
+    def check(self, option: str, poses: Path | None) -> None:
+        """Raise UserError for numbers that no recording has, and for facts of a scene without poses, from `option`."""
         if not (0 < self.rate_hz <= MAX_HZ and 0 < self.radiance_gain <= MAX_GAIN):
             found = f"{self.rate_hz:g}, {self.radiance_gain:g}"
             raise problem("--rate-hz and --radiance-gain", f"positive numbers, at most {MAX_HZ:g}", found, "correct it")
+        for name, stated in (("--licence", self.licence != "unknown"), ("--radiance-gain", self.radiance_gain != 1)):
+            if stated and poses is None:
+                expected = f"{option} beside it: streams without poses state none"
+                raise problem(name, expected, "none", f"add {option}, or leave {name} out")
 
 
 def stream_path(out: Path, camera: str, cameras: tuple[Camera, ...] | None) -> Path:

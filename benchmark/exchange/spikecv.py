@@ -52,7 +52,7 @@ def import_spikecv(
     With a nerfstudio file of poses it is a scene, else a folder of streams. Raises UserError before anything is written
     where a folder is damaged, or the poses do not fit.
     """
-    recording.check()
+    recording.check("--transforms", transforms)
     sources = _find_sources(folder)
     check_ids(sources, "camera", folder, "rename the camera's folder")
     cameras = None if transforms is None else _read_poses(transforms, sources)

@@ -237,6 +237,8 @@ def test_fisheye_coefficients_are_opencvs() -> None:
         (["--width", "41"], "expected whole ticks of 123 bytes (41x24)"),
         (["--rate-hz", "0"], "--rate-hz and --radiance-gain: expected positive numbers"),
         (["--cameras", "missing.yaml"], "missing.yaml: expected a COLMAP model, or OpenCV's or Kalibr's cameras"),
+        (["--licence", "CC0-1.0"], "--licence: expected --cameras beside it"),
+        (["--radiance-gain", "0.5"], "--radiance-gain: expected --cameras beside it"),
         (["--cameras", "in"], "in: expected a COLMAP model (cameras.bin or cameras.txt, ...), found none"),
         (["--cameras", "in/cam_00.dat"], "or a file of OpenCV or Kalibr"),
         (["--cameras", "damaged.yml"], "damaged.yml: expected cameras written by OpenCV's FileStorage"),

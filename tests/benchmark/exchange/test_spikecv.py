@@ -180,6 +180,8 @@ def test_other_refusals(tmp_path: Path, small_scene: Path) -> None:
     folder = write_spikecv(tmp_path / "cam", random_spikes(9, 5, 11))
     with pytest.raises(UserError, match="expected positive numbers, at most 1e.09, found 0, 1"):
         import_spikecv(folder, tmp_path / "out", Recording(0))
+    with pytest.raises(UserError, match="--licence: expected --transforms beside it"):
+        import_spikecv(folder, tmp_path / "out", Recording(1.0, licence="CC0-1.0"))
     scene = open_scene(small_scene)
     for command in (lambda: import_spikecv(folder, folder, Recording(1.0)), lambda: export_spikecv(scene, folder)):
         with pytest.raises(UserError, match="expected a new or empty folder"):
