@@ -99,6 +99,9 @@ def emulated_source(path: Path, rig: Path | None, mode: str, worse: Imperfection
     scene = open_scene(path)
     streams = scene_streams(scene) if mode == CLIP else _calibration_streams(scene, mode)
     profile = _scene_profile(scene, TAGGED_ROWS if worse.dropped else PLAIN) if rig is None else load_profile(rig)
+    if profile.fps != round(scene.rate_hz):
+        fix = "correct fps in the profile, or leave the profile out"
+        raise problem(f"rig {profile.name}", f"the scene's {scene.rate_hz:g} ticks per second", f"{profile.fps}", fix)
     ticks = min(len(packed) for packed in streams.values())
     if worse != PERFECT:
         return _worse_source(profile, streams, ticks, mode, worse, seed)

@@ -185,6 +185,13 @@ def test_flat_and_dark_recordings_go_into_a_clip_and_feed_calibrate(scene, tmp_p
             np.testing.assert_array_equal(ours["dark"], theirs["dark"])
 
 
+def test_a_profile_of_another_rate_than_the_scenes_is_refused(scene, tmp_path):
+    rig = rig_of(scene, tmp_path / "rig")
+    rig.write_text(rig.read_text().replace("[transfer]", "fps = 10000\n[transfer]"))
+    with pytest.raises(UserError, match="rig pair: expected the scene's 20000 ticks per second, found 10000"):
+        sources.emulated_source(scene, rig, "clip")
+
+
 def test_light_that_does_not_fit_is_refused(scene, tmp_path):
     profile = sources.emulated_source(scene, None, "clip").profile
     assert record("--emulate", scene, "--mode", "dark", "--out", tmp_path / "dark", "--seconds", "0.001") == 0
