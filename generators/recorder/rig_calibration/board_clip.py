@@ -84,8 +84,7 @@ def render_board(camera: Camera, board: Board, R: Float64, t: Float64) -> Float3
 
     Raises UserError for a camera with lens distortion.
     """
-    if camera.distortion:
-        raise problem(f"camera {camera.id}", "a pinhole", "lens distortion", "give --like a scene without it")
+    _check_pinhole(camera)
     to_camera = np.stack([camera.R @ R[:, 0], camera.R @ R[:, 1], camera.R @ t + camera.t], axis=1)
     to_board = np.linalg.inv(camera.K @ to_camera)  # (u, v, 1) -> (x, y, 1) / depth, x and y in the board's plane
     to_board[:2] /= board.square_m
@@ -94,6 +93,11 @@ def render_board(camera: Camera, board: Board, R: Float64, t: Float64) -> Float3
     part = image[top:bottom, left:right]
     in_threads(_render_rows, len(part), to_board, board.columns, board.rows, left, top, part, small=part.size < 20000)
     return image
+
+
+def _check_pinhole(camera: Camera) -> None:
+    if camera.distortion:
+        raise problem(f"camera {camera.id}", "a pinhole", "lens distortion", "give --like a scene without it")
 
 
 def _bounds(camera: Camera, board: Board, R: Float64, t: Float64) -> tuple[int, int, int, int]:
@@ -150,7 +154,12 @@ def _light(h: Float64, columns: int, rows: int, x: float, y: float) -> float:
 def write_board_clip(
     out: Path, cameras: tuple[Camera, ...], board: Board, distance_m: float, n_ticks: int, seed: int = 0
 ) -> Path:
-    """Write the clip as a scene folder and return its path. Raises UserError where the folder exists."""
+    """Write the clip as a scene folder and return its path.
+
+    Raises UserError where the folder exists, and for lens distortion.
+    """
+    for camera in cameras:
+        _check_pinhole(camera)
     check_new(out)
     spacing = key_spacing(cameras, board, distance_m, n_ticks)
     key_ticks = list(range(0, n_ticks + spacing, spacing))

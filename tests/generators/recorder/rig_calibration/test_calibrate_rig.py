@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,6 +99,13 @@ def test_a_board_clip_is_a_scene_and_overwrites_no_other(tmp_path, capsys):
     assert main(arguments) == 2
     assert main([*arguments[:2], str(tmp_path / "c"), "--seconds", "0.00001"]) == 2
     assert "from 5e-05, one tick" in capsys.readouterr().err
+
+
+def test_a_lens_is_refused_before_anything_is_written(tmp_path):
+    cameras = (*CAMERAS[:2], replace(CAMERAS[2], distortion=(-0.2, 0.0, 0.0, 0.0, 0.0)))
+    with pytest.raises(UserError, match="camera cam_02: expected a pinhole"):
+        write_board_clip(tmp_path / "b", cameras, BOARD, DISTANCE_M, 40)
+    assert not (tmp_path / "b").exists()
 
 
 def test_any_array_films_the_board(small_scene, tmp_path):
