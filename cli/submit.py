@@ -9,6 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.leaderboard import submit as work
 from spike4dgs.leaderboard.submit import Files, Submitted
@@ -45,6 +46,8 @@ def submit(
         container: Command that starts the process of the second fit, such as one of bwrap or docker; {work} and {part}
             in it are the folders that the process needs.
     """
+    if container and not refit:
+        raise problem("--container", "--refit beside it", "none", "add --refit, or leave --container out")
     files = Files(predictions, scenes, allow_gaps, second_renderings_of, refit, container)
     return _tell(work.submit(result, files, leaderboard, replace))
 

@@ -43,11 +43,12 @@ DAT_FILE = DatFile()
 def open_streams(path: Path, dat_file: DatFile = DAT_FILE, allow_gaps: bool = False) -> dict[str, SpikeStream] | Scene:
     """Return a scene, or the streams by camera of a folder of streams or a .dat file, which is called like its file.
 
-    Raises UserError for size and rate beside a folder, which states its own, and where a .dat file lacks them; the
-    error then says which sizes fit the file.
+    Raises UserError for facts of a file beside a folder, which states its own, and where a .dat file lacks size or
+    rate; the error then says which sizes fit the file.
     """
     if path.is_dir():
-        if given := [name for name, value in dat_file.options().items() if value is not None]:
+        facts = dat_file.options() | {"--rows-top-down": dat_file.rows_top_down or None}
+        if given := [name for name, value in facts.items() if value is not None]:
             expected = "nothing for a folder, which states its own size"
             raise problem(", ".join(given), expected, "values", "leave them out")
         is_streams = (path / STREAM_FOLDER).is_file()

@@ -277,6 +277,19 @@ def test_a_working_folder_whose_name_is_no_text_is_named(tmp_path: Path) -> None
     assert done.stderr.startswith("error: working folder: expected a name in UTF-8") and r"/in\xff'" in done.stderr
 
 
+def test_a_container_without_a_second_fit_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["submit", "result.json", "--container", "env"]) == 2
+    assert capsys.readouterr().err.startswith("error: --container: expected --refit beside it, found none")
+
+
+def test_a_working_folder_that_was_removed_is_one_line(tmp_path: Path) -> None:
+    code = "import os, sys; os.rmdir(os.getcwd()); from spike4dgs.cli import main; sys.exit(main(['doctor']))"
+    (tmp_path / "gone").mkdir()
+    done = python("-c", code, cwd=tmp_path / "gone")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: working folder: expected a folder, found a removed one; change to one that exists\n"
+
+
 @pytest.mark.parametrize(
     ("command", "option"),
     [

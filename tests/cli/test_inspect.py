@@ -138,6 +138,7 @@ def test_the_table_is_whole_in_a_pipe_and_in_a_file(
         (["short.dat", "--width", "40"], "no --height, --rate-hz"),
         (["short.dat", "--width", "40", "--height", "24", "--rate-hz", "0"], "a positive rate"),
         (["scene", "--width", "40"], "nothing for a folder"),
+        (["scene", "--rows-top-down"], "--rows-top-down: expected nothing for a folder"),
         (["short.dat", "--width", "40", "--height", "24", "--fps", "20000"], "use `spike4dgs inspect --rate-hz`"),
     ],
 )
