@@ -72,8 +72,15 @@ def _check_environment() -> None:
 
 
 def _check_names(arguments: Iterable[str]) -> None:
-    """Raise UserError for names that are no text: records and pages are UTF-8, and OpenEXR takes no other names."""
-    for where, name in (*(("argument", a) for a in arguments), ("working folder", os.getcwd())):
+    """Raise UserError for names that are no text: records and pages are UTF-8, and OpenEXR takes no other names.
+
+    Raises one for a working folder that was removed, too.
+    """
+    try:
+        folder = os.getcwd()
+    except FileNotFoundError:
+        raise problem("working folder", "a folder", "a removed one", "change to one that exists") from None
+    for where, name in (*(("argument", a) for a in arguments), ("working folder", folder)):
         try:
             name.encode()
         except UnicodeEncodeError:

@@ -74,6 +74,9 @@ def _accept(files: Mapping[str, WeightFile], yes: bool) -> None:
         return
     answer = ""
     if sys.stdin.isatty():
-        answer = input(f"Do you accept the licences of {', '.join(files)}? [y/N] ")
+        try:
+            answer = input(f"Do you accept the licences of {', '.join(files)}? [y/N] ")
+        except EOFError:  # Ctrl-D is no consent
+            print()
     if answer.strip().lower() not in ("y", "yes"):
         raise problem("licences", "your consent to the licences above", "none", "add --yes to accept them")

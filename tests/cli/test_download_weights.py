@@ -62,11 +62,18 @@ def test_weights_go_where_they_are_looked_for(server: Path, hub: Path, capsys: p
 def test_licences_are_asked_for_first(
     server: Path, hub: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+
+    def ctrl_d(prompt: str) -> str:
+        raise EOFError
+
     with serve(server) as (address, seen):
         with pytest.raises(UserError, match="licences: expected your consent .*; add --yes to accept them"):
             command("lpips", source=address)
         monkeypatch.setattr(command_module.sys.stdin, "isatty", lambda: True, raising=False)
         monkeypatch.setattr("builtins.input", lambda prompt: "no")
+        with pytest.raises(UserError, match="your consent"):
+            command("lpips", source=address)
+        monkeypatch.setattr("builtins.input", ctrl_d)
         with pytest.raises(UserError, match="your consent"):
             command("lpips", source=address)
         assert not seen.requests and not hub.exists()
