@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
@@ -45,6 +45,8 @@ from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
 from spike4dgs.leaderboard.reading import typical_fit_seconds
 from spike4dgs.leaderboard.tracks import is_equivalent, release_line, track_scenes
+
+_NEEDS = {"profile": ("table",), "data": ("table", "track"), "source": ("track",)}  # what they do nothing without
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,11 @@ def run_benchmark(
     if choice.track is not None and (scenes or choice.table is not None):
         found = str(scenes[0]) if scenes else f"--table {choice.table}"
         raise problem("--track", "neither scenes nor a table beside it", found, "use --data for the folder")
+    given = _given(choice)
+    for option, needed in _NEEDS.items():
+        if option in given and not any(other in given for other in needed):
+            expected = f"{' or '.join(f'--{other}' for other in needed)} beside it"
+            raise problem(given[option], expected, "none", f"leave {given[option]} out")
     if choice.table == IMAGE_TABLE:
         return _measure_images(scenes, choice, fits, entries)
     paper = None if choice.table is None else published(choice.table, choice.poses)
@@ -160,13 +167,22 @@ def run_benchmark(
     return _finish(runs, scenes, choice.allow_gaps, entries)
 
 
+def _given(group: SceneChoice | FitChoice | EntryChoice) -> dict[str, str]:
+    """Return the fields that differ from their defaults, each with the name of its option."""
+    options = {"settings": "--set", "source": "--from"}
+    names = [f.name for f in fields(group) if getattr(group, f.name) != f.default]
+    return {name: options.get(name, f"--{name.replace('_', '-')}") for name in names}
+
+
 def _measure_images(scenes: tuple[Path, ...], choice: SceneChoice, fits: FitChoice, entries: EntryChoice) -> int:
     """Make table 6, which compares images from spikes and fits no method."""
     from spike4dgs.studies.images import images
 
-    given = {"--methods": fits.methods, "--set": fits.settings, "--split": choice.split, "--seeds": fits.seeds > 1}
-    for option in (name for name, value in {**given, "--leaderboard": entries.leaderboard}.items() if value):
+    given = _given(choice) | _given(fits) | _given(entries)
+    for option in (given[name] for name in given if name not in ("table", "data", "profile", "allow_gaps", "out")):
         raise problem(option, "no --table 6 beside it, which fits nothing", "both", "leave one of them out")
+    for option in (given[name] for name in ("data", "profile") if scenes and name in given):
+        raise problem(option, "no scene folders beside it", str(scenes[0]), "leave one of them out")
 
     worlds = [world for number in (1, 2) for world in published(number).worlds]
     data, profile = choice.data, choice.profile
