@@ -27,7 +27,7 @@ from spike4dgs.benchmark.spikes.gaps import Gap, read_gaps
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick, open_stream
 
 WORKERS = 4
-_STARTED = ".download.json"  # in a scene folder: which version of the scene is being fetched into it
+_STARTED = ".download.json"  # in a folder: which version of a scene, or which excerpt, is being fetched into it
 _PENDING = ".manifest.json"  # manifest.json until all else is there
 
 
@@ -153,11 +153,18 @@ class _Download:
         }
         cut = (ticks.start * tick_bytes, ticks.stop * tick_bytes)
         wanted = [Wanted(shard, m, root / f"{m.camera}.dat", cut) for shard, m in self._members(scene)]
-        if (root / folder.NAME).is_file():  # what it describes is whole
+        started = root / _STARTED
+        if (root / folder.NAME).is_file():
             if read_json(root / folder.NAME, "a description of streams").get("excerpt") != excerpt:
                 raise problem(root, "this window of the scene, or no folder", "something else", "choose another --out")
-            wanted = [w for w in wanted if not w.path.is_file()]
-        transfer(self.source, wanted, self.progress, self.workers)
+        elif not (started.is_file() and read_json(started, "the record of a download").get("excerpt") == excerpt):
+            for w in wanted:  # of another window or by another program: nothing says of which ticks
+                w.path.unlink(missing_ok=True)
+            write_json(started, {"excerpt": excerpt})
+        whole = [w for w in wanted if w.path.is_file()]  # a file gets its name last
+        for w in whole:
+            w.part.unlink(missing_ok=True)
+        transfer(self.source, [w for w in wanted if w not in whole], self.progress, self.workers)
         streams = {}
         for path in visible(root, "*.dat"):
             size, order, gaps = (scene.width, scene.height), scene.rows_bottom_up, _gaps_in(scene, path.stem, ticks)
@@ -165,6 +172,7 @@ class _Download:
                 path, *size, scene.rate_hz, rows_bottom_up=order, n_ticks=len(ticks), gaps=gaps
             )
         folder.write_stream_folder(root, streams, {"excerpt": excerpt})
+        started.unlink(missing_ok=True)
 
     def _members(self, scene: SceneEntry) -> Iterator[tuple[Shard, Member]]:
         """Yield the files that are asked of a scene, from the lists of those shards that hold some."""

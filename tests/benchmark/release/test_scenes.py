@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from changes import exchange, files_in, flip_bit
+from changes import edit_json, exchange, files_in, flip_bit
 from fake_hub import REPOSITORY, serve_hub
 from range_server import Behaviour, serve
 from small_scenes import write_small_scene
@@ -261,6 +261,25 @@ class TestSelection:
         with serve(release_folder) as (address, seen):
             fetch(address, tmp_path, Selection(("pattern-0",), ("cam_01",), (), window))
         assert seen.asked() == [], "it is there"
+
+    def test_a_window_goes_on_with_the_cameras_that_are_missing(self, release_folder: Path, tmp_path: Path) -> None:
+        chosen = Selection(("pattern-0",), ("cam_00", "cam_02"), (), (100.0, 120.0))
+        started = tmp_path / "pattern-0-100-120ms/.download.json"
+
+        def begin(other: int = 0) -> int:
+            """Fetch one camera, in a download that then fails; return how many another one asks for."""
+            with serve(release_folder, Behaviour(failures=[0, *[500] * 8])) as (address, _), pytest.raises(UserError):
+                fetch(address, tmp_path, chosen, 1)
+            assert len(list(started.parent.glob("*.dat"))) == 1
+            edit_json(started, lambda facts: facts["excerpt"].update(first_tick=facts["excerpt"]["first_tick"] + other))
+            with serve(release_folder) as (address, seen):
+                fetch(address, tmp_path, chosen)
+            assert len(open_stream_folder(started.parent)) == 2 and not started.exists()
+            shutil.rmtree(started.parent)
+            return len(seen.asked())
+
+        assert begin() == 1
+        assert begin(other=1) == 2, "the one that is there is of other ticks"
 
     def test_what_the_release_has_not(self, release_folder: Path, tmp_path: Path) -> None:
         for chosen, words in (
