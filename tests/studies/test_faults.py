@@ -14,8 +14,8 @@ from skimage.metrics import peak_signal_noise_ratio
 from small_scenes import HEIGHT, WIDTH
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.runs.predictions import open_predictions
-from spike4dgs.benchmark.scene.images import write_exr, write_mask
+from spike4dgs.benchmark.runs.predictions import open_predictions, write_predictions
+from spike4dgs.benchmark.scene.images import write_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
@@ -134,9 +134,8 @@ def test_a_scene_in_which_nothing_moves_has_no_score_where_things_move(small_sce
         write_mask(mask, np.zeros((HEIGHT, WIDTH), bool))
     write_manifest(small_scene)
     scene = open_scene(small_scene)
-    for target in scene.targets:
-        write_exr(tmp_path / f"{target.name}.exr", scene.ground_truth(target) + np.float32(0.1), 0)
-    found = fault_table._scores(tmp_path, scene)
+    darker = {target: scene.ground_truth(target) - np.float32(0.1) for target in scene.targets}
+    found = fault_table._scores(write_predictions(tmp_path / "predictions", scene, darker, "mine"), scene)
     assert found["psnr"] == pytest.approx(20, abs=0.1) and found["psnr_dynamic"] is None
 
 

@@ -53,14 +53,15 @@ def write_small_scene(
     splits: bool = False,
     extras: Mapping[str, dict[str, Any]] | None = None,
     width: int = WIDTH,
+    height: int = HEIGHT,
 ) -> Path:
     """A scene without Mitsuba: a pattern that drifts to the right; cam_03 is held out, targets every 20 ticks.
 
     With `splits` it has the standard ones; `corner` holds out cam_00, with two targets.
     """
     rng = np.random.default_rng(seed)
-    cameras = array_cameras(width=width)
-    y, x = np.mgrid[:HEIGHT, :width].astype(np.float64)
+    cameras = array_cameras(width=width, height=height)
+    y, x = np.mgrid[:height, :width].astype(np.float64)
     targets = tuple(Target("cam_03", t) for t in (20, 40, 60))
     if splits:
         targets += (Target("cam_00", 30), Target("cam_00", 50))
@@ -69,8 +70,8 @@ def write_small_scene(
         return 0.45 + 0.3 * np.sin((x - 0.1 * tick - 2 * camera) / 4) * np.cos(y / 5)
 
     for i, c in enumerate(cameras):
-        charge = rng.random((HEIGHT, width))
-        with SpikeWriter(root / stream_name(c.id), width, HEIGHT) as writer:
+        charge = rng.random((height, width))
+        with SpikeWriter(root / stream_name(c.id), width, height) as writer:
             for tick in range(TICKS):
                 charge += GAIN * radiance(i, tick + 0.5)
                 fired = charge >= 1

@@ -16,7 +16,6 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
-import small_scenes
 from changes import exchange, flip_bit, leave_part
 from dummy_methods import CountMethod, FailingMethod, prediction_bytes, without_timings
 from rich.console import Console
@@ -305,11 +304,8 @@ def test_scenes_and_methods_are_checked_before_any_work(small_scene: Path, tmp_p
         run(tmp_path / "out", [small_scene], CountMethod("a/b"))
 
 
-def test_views_that_no_metric_takes_are_refused_before_any_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras = small_scenes.array_cameras(width=8, height=8)
-    for name, value in (("WIDTH", 8), ("HEIGHT", 8), ("array_cameras", lambda: cameras)):
-        monkeypatch.setattr(small_scenes, name, value)
-    scene, method = write_small_scene(tmp_path / "scene"), CountMethod()
+def test_views_that_no_metric_takes_are_refused_before_any_fit(tmp_path: Path) -> None:
+    scene, method = write_small_scene(tmp_path / "scene", width=8, height=8), CountMethod()
     with pytest.raises(UserError, match="expected views of 11 pixels or more each way, found 8"):
         run(tmp_path / "out", [scene], method)
     assert not (tmp_path / "out/predictions").exists()

@@ -16,7 +16,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import small_scenes
 import torch
 from changes import leave_part
 from devtools import Page
@@ -347,11 +346,7 @@ def test_a_killed_fit_resumes(
     np.testing.assert_array_equal(load_model(out / MODEL).model.render(camera, 500.0), model.render(camera, 500.0))
 
 
-def test_views_of_a_few_pixels_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(small_scenes, "WIDTH", 8)
-    monkeypatch.setattr(small_scenes, "HEIGHT", 8)
-    cameras = small_scenes.array_cameras(width=8, height=8)
-    monkeypatch.setattr(small_scenes, "array_cameras", lambda: cameras)
-    scene = small_scenes.write_small_scene(tmp_path / "scene")
+def test_views_of_a_few_pixels_are_refused(tmp_path: Path) -> None:
+    scene = write_small_scene(tmp_path / "scene", width=8, height=8)
     with pytest.raises(UserError, match="expected views of 16 pixels or more each way, found 8"):
         open_recording(scene)
