@@ -5,55 +5,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable
-from functools import lru_cache
-from json.encoder import encode_basestring_ascii
 from typing import Any
 
 MOST_DEPTH = 64  # of nested JSON values; programs that walk along them need a depth for each
-_CONTAINERS = (dict, list, tuple)
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def json_text(value: Any) -> str:
-    """Return the text that `write_json` writes: equal values have equal texts.
-
-    It is that of json.dumps with an indent of 2, which is written in Python; here objects and lists without others in
-    them are left to its encoder in C.
-    """
-    return _indented(value, "\n") + "\n"
-
-
-def _indented(value: Any, line: str) -> str:
-    """Return a JSON value as text; `line` is a line break and the indent of the line that the value is in."""
-    inner = line + "  "
-    if not isinstance(value, _CONTAINERS) or not value:
-        return encode_basestring_ascii(value) if type(value) is str else _encode(inner, value)
-    if not _has_containers(value.values() if isinstance(value, dict) else value):
-        text = _encode(inner, value)
-        return f"{text[0]}{inner}{text[1:-1]}{line}{text[-1]}"
-    if not isinstance(value, dict):
-        return f"[{inner}{f',{inner}'.join(_indented(v, inner) for v in value)}{line}]"
-    if not all(isinstance(key, str) for key in value):
-        return json.dumps(value, indent=2, sort_keys=True, allow_nan=False).replace("\n", line)
-    items = [f"{encode_basestring_ascii(key)}: {_indented(value[key], inner)}" for key in sorted(value)]
-    return f"{{{inner}{f',{inner}'.join(items)}{line}}}"
-
-
-def _has_containers(parts: Iterable[Any]) -> bool:
-    for part in parts:
-        if isinstance(part, _CONTAINERS):
-            return True
-    return False
-
-
-def _encode(inner: str, value: Any) -> str:
-    return _encoder(inner).encode(value)
-
-
-@lru_cache(64)
-def _encoder(inner: str) -> json.JSONEncoder:
-    return json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(f",{inner}", ": "))
+    """Return the text of files of ours: equal values have equal texts. Raises ValueError for NaN and infinity."""
+    return json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
 
 
 def parse_json(text: str) -> Any:
