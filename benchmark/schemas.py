@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import cache
 from importlib.resources import files as package_files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.json_values.schema_checks import Check, compiled
 
 if TYPE_CHECKING:
     from referencing.jsonschema import SchemaRegistry
@@ -35,18 +35,33 @@ def _registry() -> SchemaRegistry:
     return resources
 
 
-_checks: dict[int, tuple[dict[str, Any], Check]] = {}  # by the schema's id; it is kept, so that no other takes its id
+_compiled: dict[int, tuple[dict[str, Any], Callable[[Any], Any]]] = {}  # by id of a schema, which it keeps alive
 
 
-def _check_of(schema: dict[str, Any]) -> Check:
-    if id(schema) not in _checks:
-        _checks[id(schema)] = schema, compiled(schema, lambda name: load_schema("spike4dgs.benchmark", name))
-    return _checks[id(schema)][1]
+def _is_taken(value: Any, schema: dict[str, Any]) -> bool:
+    """Return whether fastjsonschema takes a value, which is some forty times as fast as jsonschema.
+
+    What it takes, jsonschema takes too. Where it refuses a value, jsonschema says what is wrong, or takes the value.
+    """
+    import fastjsonschema
+
+    if id(schema) not in _compiled:
+        check = fastjsonschema.compile(
+            {**schema, "$schema": "http://json-schema.org/draft-07/schema#"},  # the newest draft that it knows in full
+            handlers={"": lambda name: load_schema("spike4dgs.benchmark", name)},
+            use_default=False,
+        )
+        _compiled[id(schema)] = schema, check
+    try:
+        _compiled[id(schema)][1](value)
+    except fastjsonschema.JsonSchemaValueException:
+        return False
+    return True
 
 
 def check_schema(value: Any, schema: dict[str, Any], where: str | Path, fix: str) -> None:
     """Raise UserError that names the first difference of `value` from `schema`, and the schema's title."""
-    if _check_of(schema)(value):
+    if _is_taken(value, schema):
         return
     from jsonschema import Draft202012Validator
 

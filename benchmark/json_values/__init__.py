@@ -1,1 +1,1 @@
-"""JSON values: their text, read strictly and written always alike, and schemas that check them fast."""
+"""JSON values as text: read strictly, and written always alike."""
