@@ -36,7 +36,7 @@ from spike4dgs.benchmark.files import (
     write_json,
     write_text,
 )
-from spike4dgs.benchmark.runs.record import Record, check_form, check_method_name, check_record, with_later_metrics
+from spike4dgs.benchmark.runs.record import Record, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.thumbnails import KEY, Thumbnails, has_sheet, sheet_path, sheets
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, SHIPPED, place_of
@@ -132,7 +132,10 @@ def parse_entry(data: bytes, where: Path, path: str) -> tuple[Entry, str]:
     check_numbers(entry, where)
     sha256 = sha256_json(entry)
     check_schema(entry, load_schema("spike4dgs.leaderboard", "entry.schema.json"), where, "submit the record again")
-    entry = {**entry, "record": checked(entry["record"], where)}
+    record = with_later_metrics(entry["record"])  # its form is a part of the entry's
+    check_record(record, where)
+    check_no_oracle(record, where)
+    entry = {**entry, "record": record}
     if (name := entry_path(entry["record"], path.startswith(ARCHIVE))) != path:
         raise problem(where, f"the entry of {path}", f"that of {name}", "restore the file, or submit its record again")
     return entry, sha256
@@ -143,15 +146,6 @@ def check_listed(sha256: str, path: str, where: Path, ledger: Ledger) -> None:
     if (sha256, path) not in ledger:
         fix = "restore the entry, or submit its record again with --replace"
         raise problem(where, f"an entry as {LEDGER} lists it", "another one, as after an edit by hand", fix)
-
-
-def checked(record: Record, where: Path) -> Record:
-    """Return a record with later metrics as null. Raises UserError where it is invalid."""
-    check_form(record, where)
-    record = with_later_metrics(record)
-    check_record(record, where)
-    check_no_oracle(record, where)
-    return record
 
 
 def check_no_oracle(record: Record, where: str | Path) -> None:
