@@ -27,9 +27,6 @@ def build(seed, variant, duration_s):
         blades.append(Part(blade.moved(rotation("y", k * np.pi / 2)), Material(stripes, 0.3)))
     tiles = paving((256, 512), rng, (32, 32), (0.40, 0.48, 0.52), (0.60, 0.68, 0.70), (0.75, 0.75, 0.72), 0.12)
     return WorldScene(
-        name="pinwheel",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static={
             "floor": Part(quad((0, 0.05, 0), (3.4, 0, 0), (0, 1.5, 0)), Material(wood((320, 640), rng), 0.25)),

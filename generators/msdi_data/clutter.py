@@ -185,9 +185,6 @@ def _world(name: str, title: str, move: Callable[[np.random.Generator, Path], Pa
             paths[f"body{k}"] = move(rng, Path(turn, place, np.zeros(3), np.zeros(3)))
         light = street.Light(rng.uniform(-165, -15), rng.uniform(25, 75), rng.uniform(1.5, 3.2), rng.uniform(0.6, 1.3))
         return WorldScene(
-            name=name,
-            seed=seed,
-            variant=variant,
             duration_s=duration_s,
             static=_room(rng),
             groups={f"body{k}": (Part(replace(m, smooth=False), material),) for k, m in enumerate(meshes)},

@@ -73,8 +73,7 @@ class WorldScene:
     """One concrete world: static surfaces, moving surfaces, light and cameras. Metres, Z up, X right, Y away.
 
     Attributes:
-        name: key in `WORLDS`.
-        seed, variant, duration_s: the arguments of `build`; equal arguments give equal scenes.
+        duration_s: as `build` was given it.
         static: surfaces that never move.
         groups: rigid groups of surfaces in their own coordinates; an instance shows one group at a pose.
         instances: instance name -> group name. Only these and `deforming` move.
@@ -90,9 +89,6 @@ class WorldScene:
         flash: lamps whose brightness varies; None in steady light.
     """
 
-    name: str
-    seed: int
-    variant: int
     duration_s: float
     static: Mapping[str, Part]
     groups: Mapping[str, tuple[Part, ...]]

@@ -72,9 +72,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         return found | cycles.seated(cycle, (-0.24, 0, 1.03), (0.17, 0, 1.31), (0.44, 0.19, 0.995), feet, -0.15)
 
     return WorldScene(
-        name="bicycle",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=street.street(rng),
         groups={"frame": _frame(paint), "wheel": _wheel(), "crank": _crank(), "pedal": _pedal()} | rider,

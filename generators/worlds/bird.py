@@ -56,9 +56,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         return at
 
     return WorldScene(
-        name="bird",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=garden.garden(rng),
         groups={"bird": bird_body.body_parts(plumage, rng)},

@@ -77,9 +77,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
     stripes = cloth((48, 96), rng, [(0.80, 0.78, 0.72), (0.08, 0.16, 0.42)], 12)
     return WorldScene(
-        name="bricks",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=static,
         groups={"ball": (Part(ellipsoid((BALL_M,) * 3, (0, 0, 0), 40), Material(stripes, 0.12)),)},

@@ -51,9 +51,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         return {"body": body} | {f"rim{k}": body @ translation(*w) @ roll for k, w in enumerate(wheels)}
 
     return WorldScene(
-        name="car",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=street.street(rng),
         groups={"body": vehicle.body_parts(livery, rng), "rim": vehicle.rim_parts()},

@@ -63,9 +63,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     mesh, (owner, bodies) = merge(chips), owners(chips)
     surface = Part(mesh, Material(_image(rng), 0.3))
     return WorldScene(
-        name="chips",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=_table(throw.felt, rng),
         groups={},

@@ -55,9 +55,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         return figure.poses(stride(run.speed_m_s, run.strides_per_s, run.phase, run.lane_y_m, t_s - duration_s / 2))
 
     return WorldScene(
-        name="jaywalk",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=street.street(rng),
         groups=figure.groups(_CLOTHES[run.clothes], rng),

@@ -80,9 +80,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         return found | cycles.seated(cycle, (-0.33, 0, 0.93), (0.08, 0, 1.17), (0.40, 0.26, 0.94), feet, -0.05)
 
     return WorldScene(
-        name="motor",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=street.street(rng),
         groups={"body": body(livery), "wheel": _wheel(livery.second)} | rider,

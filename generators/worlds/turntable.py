@@ -54,9 +54,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         return {"disc": rotation("z", setup.start_rad + 2 * np.pi * setup.turns_per_s * t_s)}
 
     return WorldScene(
-        name="turntable",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=room(rng),
         groups={"disc": _disc_parts(setup, rng)},

@@ -47,9 +47,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         return {"body": body} | {f"rim{k}": body @ translation(*w) @ roll for k, w in enumerate(wheels)}
 
     return WorldScene(
-        name="van",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=street.street(rng),
         groups={"body": van_body.body_parts(livery, rng), "rim": van_body.rim_parts((0.66, 0.66, 0.65))},

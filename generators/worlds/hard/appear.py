@@ -61,9 +61,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         }
 
     return WorldScene(
-        name="appear",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=room(rng) | _screens(rng),
         groups=_movers(run, rng),

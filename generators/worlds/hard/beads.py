@@ -66,9 +66,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     bowl = revolve([(0.0, 0.0), (0.05, 0.0), (0.085, 0.045), (0.08, 0.045), (0.045, 0.006), (0.0, 0.006)], 40)
     glass = Part(local, Material(np.float32([np.repeat(_COLOURS, 4, axis=0)]), 0.1))
     return WorldScene(
-        name="beads",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=room(rng) | {"bowl": Part(bowl, Material((0.55, 0.60, 0.62), 0.15))},
         groups={},

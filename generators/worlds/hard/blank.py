@@ -60,9 +60,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     ]
     floor, wall = quad((0, 0, 0), (6, 0, 0), (0, 4, 0)), quad((0, 0.7, 1.5), (6, 0, 0), (0, 0, 3))
     return WorldScene(
-        name="blank",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static={"floor": Part(floor, Material(throw.room)), "wall": Part(wall, Material(throw.room))},
         groups={"jug": tuple(Part(mesh, Material(throw.jug)) for mesh in jug)},

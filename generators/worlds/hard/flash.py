@@ -74,9 +74,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         "beam_width": 12.0,
     }
     return WorldScene(
-        name="flash",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=room(rng),
         groups={"block": (Part(box((0.09, 0.09, 0.09)), Material(face)),)},

@@ -64,9 +64,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
         }
 
     return WorldScene(
-        name="mirror",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=_static(rng),
         groups=_movers(throw, rng),

@@ -67,9 +67,6 @@ def build(seed: int, variant: int, duration_s: float) -> WorldScene:
 
     stripes = Material(cloth((48, 120), rng, BEACH_BALL, 15), 0.12)
     return WorldScene(
-        name="rain",
-        seed=seed,
-        variant=variant,
         duration_s=duration_s,
         static=garden.garden(rng),
         groups={"ball": (Part(ellipsoid([_BALL_M] * 3, segments=40), stripes),)},
