@@ -29,7 +29,6 @@ from spike4dgs.benchmark.reports.benchmark import SplitRun, run_split
 from spike4dgs.benchmark.reports.console import Columns, make_console
 from spike4dgs.benchmark.reports.paper_files import in_every_split, write_paper_table
 from spike4dgs.benchmark.reports.paper_tables import (
-    IMAGE_TABLE,
     POSES,
     PublishedTable,
     over_seeds,
@@ -55,7 +54,7 @@ class SceneChoice:
 
     Args:
         table: Instead of scenes, a table of the paper: 1 (outdoor), 2 (objects), 3 (components), 4 (supervision), 5
-            (number of views; plotted in views.png), 6 (images from spikes), 7 (MSDI without SPSS).
+            (number of views; plotted in views.png), 7 (MSDI without SPSS).
         poses: Of table 1 or 2: given (methods get the rig's poses) or estimated (each estimates its own).
         track: Instead of scenes, a track such as ideal: its scenes in DATA; those that are missing are
             downloaded.
@@ -142,10 +141,9 @@ def run_benchmark(
     Args:
         scenes: Scene folders.
     """
-    if choice.poses != POSES[0] and choice.table in (None, IMAGE_TABLE):
-        found = f"--table {choice.table}" if choice.table else "no table"
-        fix = "without a table, name the methods, such as tfp+colmap+4dgs"
-        raise problem("--poses", "--table 1 or 2 beside it", found, fix)
+    if choice.poses != POSES[0] and choice.table is None:
+        fix = "name the methods, such as tfp+colmap+4dgs"
+        raise problem("--poses", "--table 1 or 2 beside it", "no table", fix)
     if choice.track is not None and (scenes or choice.table is not None):
         found = str(scenes[0]) if scenes else f"--table {choice.table}"
         raise problem("--track", "neither scenes nor a table beside it", found, "use --data for the folder")
@@ -154,8 +152,6 @@ def run_benchmark(
         if option in given and not any(other in given for other in needed):
             expected = f"{' or '.join(f'--{other}' for other in needed)} beside it"
             raise problem(given[option], expected, "none", f"leave {given[option]} out")
-    if choice.table == IMAGE_TABLE:
-        return _measure_images(scenes, choice, fits, entries)
     paper = None if choice.table is None else published(choice.table, choice.poses)
     if paper:
         if scenes:
@@ -172,25 +168,6 @@ def _given(group: SceneChoice | FitChoice | EntryChoice) -> dict[str, str]:
     options = {"settings": "--set", "source": "--from"}
     names = [f.name for f in fields(group) if getattr(group, f.name) != f.default]
     return {name: options.get(name, f"--{name.replace('_', '-')}") for name in names}
-
-
-def _measure_images(scenes: tuple[Path, ...], choice: SceneChoice, fits: FitChoice, entries: EntryChoice) -> int:
-    """Make table 6, which compares images from spikes and fits no method."""
-    from spike4dgs.studies.images import images
-
-    given = _given(choice) | _given(fits) | _given(entries)
-    for option in (given[name] for name in given if name not in ("table", "data", "profile", "allow_gaps", "out")):
-        raise problem(option, "no --table 6 beside it, which fits nothing", "both", "leave one of them out")
-    for option in (given[name] for name in ("data", "profile") if scenes and name in given):
-        raise problem(option, "no scene folders beside it", str(scenes[0]), "leave one of them out")
-
-    worlds = [world for number in (1, 2) for world in published(number).worlds]
-    data, profile = choice.data, choice.profile
-    chosen = scenes or tuple(p for world in worlds if (p := data / f"{world}-0-{profile}").is_dir())
-    if not chosen:
-        fix = f"spike4dgs make-dataset --all --profile {profile} --out {data}"
-        raise problem(data, f"a scene WORLD-0-{profile}", "none", fix)
-    return images(chosen, out=fits.out, allow_gaps=choice.allow_gaps)
 
 
 def _run_table(paper: PublishedTable, choice: SceneChoice, fits: FitChoice, entries: EntryChoice) -> int:

@@ -214,50 +214,19 @@ def test_bad_arguments_are_user_errors(
 
 
 @pytest.mark.usefixtures("installed", "no_images")
-def test_a_track_and_table_6_are_modes_of_their_own(
-    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, measured = tmp_path / "out", list[tuple[Path, ...]]()
-    monkeypatch.setattr("spike4dgs.studies.images.images", lambda scenes, **_: measured.append(scenes) or 0)
+def test_a_track_is_a_mode_of_its_own(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
     monkeypatch.setattr(command, "track_scenes", lambda name: {small_scene.name: open_scene(small_scene).revision})
-    assert run_benchmark((small_scene,), table=6, out=out) == 0 and not out.exists()
-    assert measured == [(small_scene,)]
     options = {"data": small_scene.parent, "methods": ("counts",), "device": "cpu", "metrics": ("psnr",)}
     assert run_here(track="moon", out=out, **options) == 0
     assert (out / "leaderboard/local").is_dir(), "the scenes of the track are those in the folder"
-    for table in (1, 6):
-        with pytest.raises(UserError, match=f"--track: expected neither scenes nor a table .*, found --table {table}"):
-            run_benchmark(track="moon", table=table)
+    with pytest.raises(UserError, match="--track: expected neither scenes nor a table .*, found --table 1"):
+        run_benchmark(track="moon", table=1)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        *(
-            (
-                ["--table", "6", *option.split()],
-                f"{option.split()[0]}: expected no --table 6 beside it, which fits nothing",
-            )
-            for option in (
-                "--methods counts",
-                "--set motion.lr_grid=0.005",
-                "--split corner",
-                "--seed 1",
-                "--seeds 2",
-                "--device cpu",
-                "--metrics psnr",
-                "--budget paper",
-                "--workers 2",
-                "--scheduler tcp://nowhere:1",
-                "--refit",
-                "--in-process",
-                "--columns all",
-                "--replace",
-                "--leaderboard board",
-            )
-        ),
-        (["--table", "6", "--from", "release"], "--from: expected --track beside it, found none"),
-        (["scene", "--table", "6", "--data", "elsewhere"], "--data: expected no scene folders beside it, found scene"),
         (["--table", "1", "--from", "release"], "--from: expected --track beside it, found none"),
         (["scene", "--from", "release"], "--from: expected --track beside it, found none"),
         (["scene", "--profile", "paper"], "--profile: expected --table beside it, found none"),
