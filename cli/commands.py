@@ -9,24 +9,6 @@ from __future__ import annotations
 from spike4dgs.cli.command import Command
 from spike4dgs.cli.measurements import MEASUREMENTS
 
-# What had another name: a command, or an option of one -> what to type today.
-MOVED = {
-    "run-benchmark --oracle": "report oracle-ladder",
-    "run-benchmark --oracle-samples": "report oracle-ladder",
-    "inspect --fps": "inspect --rate-hz",
-    "inspect --top-down": "inspect --rows-top-down",
-    "spacing": "report speed-error --only keys",
-    "tradeoff": "report speed-error --only rendering",
-    "poses --refine": "run-benchmark SCENE --methods tfp+colmap+4dgs --set trainer.refine_poses=true",
-    "speed splat": "report speed-error --only splat-torch",
-    "speed ssim": "report speed-error --only ssim",
-    "speed simulate": "report speed-error --only sensor",
-    "speed decode": "report speed-error --only decoding",
-    "speed metrics": "report speed-error --only scale-metrics flip",
-    "speed tfi": "speed images",
-    "speed tfp": "speed images",
-}
-
 # Headings of --help, in its order -> the commands below them, by their first words.
 GROUPS: dict[str, str] = {
     "Make data": "make-dataset worlds verify calibrate",

@@ -19,7 +19,7 @@ from typing import Any, get_args, get_type_hints
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.cli.command import Command
-from spike4dgs.cli.commands import COMMANDS, GROUPS, MOVED
+from spike4dgs.cli.commands import COMMANDS, GROUPS
 
 _MOST = 1e12  # of a number on the command line
 _NARROWEST = 60  # characters of a line of the overview
@@ -98,9 +98,6 @@ def _dispatch(arguments: list[str]) -> int:
     if name == "--version":
         print(version("spike4dgs"))
         return 0
-    for old in (name, *(f"{name} {word}" for word in rest)):
-        if old in MOVED:
-            raise problem(f"spike4dgs {old}", "its new name", "the old one", f"use `spike4dgs {MOVED[old]}`")
     if verbs := {two: c for two, c in COMMANDS.items() if two.startswith(f"{name} ")}:
         if rest and f"{name} {rest[0]}" in verbs:
             name, rest = f"{name} {rest[0]}", rest[1:]

@@ -97,7 +97,6 @@ def test_every_command_has_help_with_an_example(name: str, capsys: pytest.Captur
         (["scroe"], "found 'scroe'; did you mean `spike4dgs score`?"),
         (["zzz"], "see `spike4dgs --help`"),
         (["speed", "rendr"], "did you mean `spike4dgs speed render`?"),
-        (["speed", "ssim"], "found the old one; use `spike4dgs report speed-error --only ssim`"),
         (["score", "nowhere", "also-nowhere"], "also-nowhere: expected a scene folder, found no such folder"),
         (["submit", "nothing.json"], "nothing.json: expected a spike4dgs-result/1 record, found no such file"),
         (["verify", "nowhere"], "nowhere: expected a scene folder"),

@@ -139,7 +139,6 @@ def test_the_table_is_whole_in_a_pipe_and_in_a_file(
         (["short.dat", "--width", "40", "--height", "24", "--rate-hz", "0"], "a positive rate"),
         (["scene", "--width", "40"], "nothing for a folder"),
         (["scene", "--rows-top-down"], "--rows-top-down: expected nothing for a folder"),
-        (["short.dat", "--width", "40", "--height", "24", "--fps", "20000"], "use `spike4dgs inspect --rate-hz`"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -239,9 +239,3 @@ def test_options_that_would_do_nothing_are_refused(
 ) -> None:
     assert main(["run-benchmark", *arguments]) == 2
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("options", [["--oracle"], ["--oracle-samples", "64"]])
-def test_an_oracle_is_a_report(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run-benchmark", "scene", *options]) == 2
-    assert "use `spike4dgs report oracle-ladder`" in capsys.readouterr().err
