@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from spike4dgs.generators.worlds.base import RigSpec, World, WorldScene, rng_for
@@ -18,29 +16,13 @@ _LIVERIES = (
     Livery((0.50, 0.72, 0.30), (0.04, 0.10, 0.25), "4"),
     Livery((0.85, 0.38, 0.06), (0.04, 0.14, 0.40), "31"),
 )
-
-
-@dataclass(frozen=True)
-class _Run:
-    """The random choices of a variant: speed, lane, colours, light. The defaults are those of variant 0."""
-
-    speed_m_s: float = 32.0
-    lane_y_m: float = 2.75
-    livery: int = 0
-    light: street.Light = street.Light(azimuth_deg=-128.0, elevation_deg=46.0, sun=3.2, sky=0.75)
-
-
-def _sample(variant: int, rng: np.random.Generator) -> _Run:
-    if variant == 0:
-        return _Run()
-    light = street.Light(rng.uniform(-150, -40), rng.uniform(36, 60), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
-    return _Run(rng.uniform(32.0, 36.0), rng.uniform(2.5, 3.2), int(rng.integers(len(_LIVERIES))), light)
+_FIRST = street.Run(32.0, 2.75, 0, street.Light(azimuth_deg=-128.0, elevation_deg=46.0, sun=3.2, sky=0.75))
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     """Build the world. The car is in the middle of the frame at half of `duration_s`; it crosses the view in 0.5 s."""
     rng = rng_for("car", seed, variant)
-    run = _sample(variant, rng)
+    run = _FIRST if variant == 0 else street.draw_run(rng, (32, 36), (2.5, 3.2), len(_LIVERIES))
     wheels = vehicle.WHEELS.positions()
     livery = _LIVERIES[run.livery]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -41,29 +40,13 @@ _LIVERIES = (
     Livery((0.10, 0.48, 0.14), (0.05, 0.05, 0.06), "5"),
     Livery((0.82, 0.38, 0.03), (0.05, 0.08, 0.25), "88"),
 )
-
-
-@dataclass(frozen=True)
-class _Run:
-    """The random choices of a variant; the defaults are those of variant 0."""
-
-    speed_m_s: float = 24.0
-    lane_y_m: float = 1.2
-    livery: int = 0
-    light: street.Light = street.Light(azimuth_deg=-28.0, elevation_deg=33.0, sun=3.3, sky=0.7)
-
-
-def _sample(variant: int, rng: np.random.Generator) -> _Run:
-    if variant == 0:
-        return _Run()
-    light = street.Light(rng.uniform(-150, -25), rng.uniform(32, 58), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
-    return _Run(rng.uniform(20.0, 28.0), rng.uniform(0.6, 2.0), int(rng.integers(len(_LIVERIES))), light)
+_FIRST = street.Run(24.0, 1.2, 0, street.Light(azimuth_deg=-28.0, elevation_deg=33.0, sun=3.3, sky=0.7))
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     """Build the world. The motorcycle is in the middle of the frame at half of `duration_s`; its wheels roll."""
     rng = rng_for("motor", seed, variant)
-    run = _sample(variant, rng)
+    run = _FIRST if variant == 0 else street.draw_run(rng, (20, 28), (0.6, 2.0), len(_LIVERIES), (-150, -25), (32, 58))
     livery = _LIVERIES[run.livery]
     suit = figure.Clothes(
         livery.body, livery.second, _DARK, _DARK, skin=_DARK, helmet=livery.second, number=livery.number

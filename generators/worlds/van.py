@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from spike4dgs.generators.worlds.base import RigSpec, World, WorldScene, rng_for
@@ -16,29 +14,13 @@ _LIVERIES = (
     van_body.Livery((0.14, 0.40, 0.24), (0.80, 0.78, 0.70), (0.82, 0.80, 0.70), "BOTANIK", "PLANTS AND POTS"),
     van_body.Livery((0.45, 0.60, 0.72), (0.60, 0.10, 0.06), (0.04, 0.06, 0.20), "GAUSS", "MOVES ANYTHING"),
 )
-
-
-@dataclass(frozen=True)
-class _Run:
-    """The random choices of a variant; the defaults are those of variant 0."""
-
-    speed_m_s: float = 38.0
-    lane_y_m: float = 2.7
-    livery: int = 0
-    light: street.Light = street.Light(azimuth_deg=-62.0, elevation_deg=54.0, sun=2.8, sky=0.95)
-
-
-def _sample(variant: int, rng: np.random.Generator) -> _Run:
-    if variant == 0:
-        return _Run()
-    light = street.Light(rng.uniform(-150, -40), rng.uniform(36, 60), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
-    return _Run(rng.uniform(37.0, 42.0), rng.uniform(2.4, 3.2), int(rng.integers(len(_LIVERIES))), light)
+_FIRST = street.Run(38.0, 2.7, 0, street.Light(azimuth_deg=-62.0, elevation_deg=54.0, sun=2.8, sky=0.95))
 
 
 def build(seed: int, variant: int, duration_s: float) -> WorldScene:
     """Build the world. The van is in the middle of the frame at half of `duration_s`; its wheels roll."""
     rng = rng_for("van", seed, variant)
-    run = _sample(variant, rng)
+    run = _FIRST if variant == 0 else street.draw_run(rng, (37, 42), (2.4, 3.2), len(_LIVERIES))
     livery, wheels = _LIVERIES[run.livery], van_body.WHEELS.positions()
 
     def poses(t_s: float) -> dict[str, np.ndarray]:

@@ -44,6 +44,29 @@ class Light:
         return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
+@dataclass(frozen=True)
+class Run:
+    """A variant of a vehicle that crosses the street: its speed, lane and livery (by number), and the light."""
+
+    speed_m_s: float
+    lane_y_m: float
+    livery: int
+    light: Light
+
+
+def draw_run(
+    rng: np.random.Generator,
+    speed_m_s: tuple[float, float],
+    lane_y_m: tuple[float, float],
+    liveries: int,
+    azimuth_deg: tuple[float, float] = (-150, -40),
+    elevation_deg: tuple[float, float] = (36, 60),
+) -> Run:
+    """Return a random run, evenly between bounds, with one of so many liveries."""
+    light = Light(rng.uniform(*azimuth_deg), rng.uniform(*elevation_deg), rng.uniform(2.6, 3.4), rng.uniform(0.6, 0.95))
+    return Run(rng.uniform(*speed_m_s), rng.uniform(*lane_y_m), int(rng.integers(liveries)), light)
+
+
 def emitters(light: Light, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     """Return Mitsuba emitters: a directional sun, sampled, and a clouded sky, found by BSDF sampling only."""
     height, width = 64, 128
