@@ -58,7 +58,7 @@ def missing_rasterizer(device: str = "cuda") -> Missing | None:
         return Missing("the package numba-cuda", "none", install_line())
     if torch.version.cuda is None:
         return Missing("a PyTorch with CUDA", f"torch {torch.__version__}", PYTORCH)
-    theirs, ours = torch.version.cuda.partition(".")[0], (_version("cuda-bindings") or "").partition(".")[0]
+    theirs, ours = torch.version.cuda.partition(".")[0], (installed_version("cuda-bindings") or "").partition(".")[0]
     if ours and ours != theirs:  # both would be loaded into one process
         fix = install_line() if theirs in ("12", "13") else f"install a PyTorch for CUDA {ours} from pytorch.org"
         return Missing(f"numba-cuda for CUDA {theirs}, which PyTorch is for", f"that for CUDA {ours}", fix)
@@ -130,7 +130,7 @@ def environment(device: str) -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "packages": {name: found for name in _PACKAGES.split() if (found := _version(name))},
+        "packages": {name: found for name in _PACKAGES.split() if (found := installed_version(name))},
         "cpu": cpu_name(),
         "gpu": gpu,
         "cuda": cuda,
@@ -147,7 +147,7 @@ def harness() -> dict[str, Any]:
         commit = _git(here.parent, "rev-parse", "HEAD")
         changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no", ":/")
         dirty = None if changes is None else bool(changes)
-    return {"version": _version("spike4dgs") or "0", "commit": commit, "dirty": dirty}
+    return {"version": installed_version("spike4dgs") or "0", "commit": commit, "dirty": dirty}
 
 
 def command_line() -> str:
@@ -240,7 +240,8 @@ def _say_once(line: str) -> None:
     print(line, file=sys.stderr)
 
 
-def _version(package: str) -> str | None:
+def installed_version(package: str) -> str | None:
+    """Return the version of an installed package; None where it is not."""
     try:
         return version(package)
     except PackageNotFoundError:

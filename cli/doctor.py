@@ -10,14 +10,14 @@ import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import requires, version
 from pathlib import Path
 
 import psutil
 from rich.console import Console
 from rich.text import Text
 
-from spike4dgs.benchmark.environment import PYTORCH, cpu_name, missing_rasterizer
+from spike4dgs.benchmark.environment import PYTORCH, cpu_name, installed_version, missing_rasterizer
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.weights import ALEXNET, METAIQA, SQUEEZENET, VGG16, WeightsError, find_weights
 
@@ -136,7 +136,7 @@ def _kernels() -> Iterator[Finding]:
 def _packages() -> Iterator[Finding]:
     required = [r for r in requires("spike4dgs") or () if "extra ==" not in r]
     names = [re.split(r"[^\w.-]", r, maxsplit=1)[0] for r in required]
-    absent = [name for name in names if _version(name) is None]
+    absent = [name for name in names if installed_version(name) is None]
     found = f"not installed: {', '.join(absent)}" if absent else f"the {len(names)} that are required are installed"
     yield Finding("packages", BROKEN if absent else OK, found, f"pip install {' '.join(absent)}" if absent else "")
 
@@ -172,7 +172,7 @@ def _gpu() -> Iterator[Finding]:
             yield Finding("GPU", MISSING, f"an NVIDIA driver, but torch {torch.__version__} sees no device", PYTORCH)
         else:
             yield Finding("GPU", NOTE, "no CUDA device; everything runs on the CPU")
-        numba = f"numba-cuda {_version('numba-cuda') or 'none'}; only a CUDA device needs it"
+        numba = f"numba-cuda {installed_version('numba-cuda') or 'none'}; only a CUDA device needs it"
         yield Finding("CUDA kernels", NOTE, numba)
         return
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
@@ -181,11 +181,12 @@ def _gpu() -> Iterator[Finding]:
         found = f"renders on the CPU: needs {missing.expected}, found {missing.found}"
         yield Finding("CUDA kernels", MISSING, found, missing.fix)
     else:
-        yield Finding("CUDA kernels", OK, f"numba-cuda {_version('numba-cuda')}; a kernel was compiled and run")
+        found = f"numba-cuda {installed_version('numba-cuda')}; a kernel was compiled and run"
+        yield Finding("CUDA kernels", OK, found)
 
 
 def _optional() -> Iterator[Finding]:
-    optional = [(name, _version(name), f"pip install 'spike4dgs[{extra}]'", why) for name, extra, why in OPTIONAL]
+    optional = [(p, installed_version(p), f"pip install 'spike4dgs[{extra}]'", why) for p, extra, why in OPTIONAL]
     for library, package, purpose in LIBRARIES:
         optional.append((package, ctypes.util.find_library(library), f"apt-get install {package}", purpose))
     for name, found, fix, purpose in optional:
@@ -240,13 +241,6 @@ def _weights(network: str) -> Path:
 # What finds the weights of a network, or raises UserError.
 _NETWORKS = ("MSDI", "MSDI's images", "matching", "Spk2ImgNet", "DUSt3R")
 NETWORKS: dict[str, Callable[[], Path]] = {name: partial(_weights, name) for name in _NETWORKS}
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _print(console: Console, finding: Finding, indent: int) -> None:

@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.environment import installed_version
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, read_json, remove_parts, sha256_json, write_json, writing
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
@@ -127,13 +127,9 @@ class Maker:
 
     @cached_property
     def _versions(self) -> dict[str, str]:
-        found = {"mitsuba_variant": str(load_mitsuba().variant())}
-        for package in ("spike4dgs", "mitsuba", "drjit", "mujoco", "numba", "numpy", "scipy"):
-            try:
-                found[package] = version(package)
-            except PackageNotFoundError:
-                found[package] = "unknown"
-        return found
+        packages = ("spike4dgs", "mitsuba", "drjit", "mujoco", "numba", "numpy", "scipy")
+        found = {package: installed_version(package) or "unknown" for package in packages}
+        return {"mitsuba_variant": str(load_mitsuba().variant()), **found}
 
     # ------------------------------------------------------------ stages
 
