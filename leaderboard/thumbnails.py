@@ -83,7 +83,7 @@ def make_thumbnails(record: Record, predictions: Path, scenes: Sequence[Scene]) 
     y = 0
     for row in rows:
         sheet[y : (y := y + len(row)), : row.shape[1]] = row
-    data = _webp(sheet)
+    data = webp(sheet, quality=QUALITY, method=6)
     return Thumbnails(data, {"sha256": hashlib.sha256(data).hexdigest(), "scenes": stated})
 
 
@@ -121,11 +121,12 @@ def _shrunk(box: Box, shrink: float, width: int, height: int) -> Box:
     return Box(left, top, min(max(right - left, 1), width - left), min(max(bottom - top, 1), height - top))
 
 
-def _webp(sheet: UInt8) -> bytes:
+def webp(image: UInt8, **options: Any) -> bytes:
+    """Return an 8-bit image, gray [H, W] or RGB [H, W, 3], as WebP, with options of Pillow."""
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(sheet).convert("RGB").save(out, "WEBP", quality=QUALITY, method=6)
+    Image.fromarray(image).convert("RGB").save(out, "WEBP", **options)
     return out.getvalue()
 
 

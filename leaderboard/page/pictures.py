@@ -6,7 +6,6 @@ thumbnails of the entries, one target each, which the page cuts from the sheets.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.page.rows import Board
-from spike4dgs.leaderboard.thumbnails import SUFFIX, read_sheet, sheet_size, top_of
+from spike4dgs.leaderboard.thumbnails import SUFFIX, read_sheet, sheet_size, top_of, webp
 
 FOLDER = "pictures"
 
@@ -118,7 +117,7 @@ def _write_scene(
 
     def write(name: str, image: UInt8) -> None:
         path = out / below / name
-        write_bytes(path, webp(image))
+        write_bytes(path, webp(image, lossless=True))
         written.add(path)
 
     for k, truth in enumerate(truths):
@@ -152,12 +151,3 @@ def _write_scene(
         "scales": scales,  # of error maps, by row: what the page starts with
         "rows": rows,
     }
-
-
-def webp(image: UInt8) -> bytes:
-    """Return an 8-bit image, gray [H, W] or RGB [H, W, 3], as lossless WebP."""
-    from PIL import Image
-
-    out = io.BytesIO()
-    Image.fromarray(image).convert("RGB").save(out, "WEBP", lossless=True)
-    return out.getvalue()
