@@ -43,11 +43,6 @@ class Sim3:
         R = camera.R @ self.R.T
         return replace(camera, R=R, t=-R @ self(camera.center[None])[0])
 
-    @property
-    def inverse(self) -> Sim3:
-        """The similarity that undoes this one."""
-        return Sim3(1 / self.scale, self.R.T, -self.R.T @ self.t / self.scale)
-
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:

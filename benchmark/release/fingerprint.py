@@ -65,16 +65,10 @@ class Fingerprint:
 
 @dataclass(frozen=True)
 class Match:
-    """A scene next to a fingerprint: why it is another one (nothing for an equivalent scene), and the share of bits.
+    """A scene next to a fingerprint: why it is another one (nothing for an equivalent scene), and the share of bits."""
 
-    `bits` is the share of the sampled bits of all streams that differ, `bits_bound` that which it stays below with a
-    probability of 99.9 %.
-    """
-
-    scene: str
     revision: str  # of the fingerprint
-    bits: float
-    bits_bound: float
+    bits: float  # share of the sampled bits of all streams that differ
     reasons: tuple[str, ...]
 
     @property
@@ -108,10 +102,10 @@ def compare(scene: Scene, reference: Fingerprint) -> Match:
     own = make_fingerprint(scene)
     if (reasons := tuple(_other_facts(own.facts, reference.facts))) or own.arrays.keys() != reference.arrays.keys():
         reasons = reasons or ("other files: cameras, images or recordings",)
-        return Match(scene.id, reference.revision, 1.0, 1.0, reasons)
+        return Match(reference.revision, 1.0, reasons)
     pairs = {key: (own.arrays[key], reference.arrays[key]) for key in own.arrays}
     if other := next((key for key, (a, b) in pairs.items() if a.shape != b.shape), None):
-        return Match(scene.id, reference.revision, 1.0, 1.0, (f"{other}: another size",))
+        return Match(reference.revision, 1.0, (f"{other}: another size",))
     samples = [pair for key, pair in pairs.items() if key.startswith("sample/")]
     differing = sum(int(np.bitwise_count(a ^ b).sum()) for a, b in samples)
     total = 8 * sum(a.size for a, _ in samples)
@@ -119,7 +113,7 @@ def compare(scene: Scene, reference: Fingerprint) -> Match:
     reasons = (
         (f"{bits:.2%} of the spike bits differ, {MOST_BITS:.0%} at most by rounding",) if bound > MOST_BITS else ()
     )
-    return Match(scene.id, reference.revision, bits, bound, (*reasons, *_other_blocks(scene, pairs)))
+    return Match(reference.revision, bits, (*reasons, *_other_blocks(scene, pairs)))
 
 
 def write_fingerprint(path: Path, fingerprint: Fingerprint) -> None:

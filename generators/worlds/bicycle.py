@@ -16,7 +16,7 @@ AXLES_X_M = {"rear": -0.495, "front": 0.495}
 CRANK_AT = (-0.07, 0.0, 0.29)
 CRANK_M = 0.17
 _GEAR = 3.1  # turns of a wheel to one of the cranks
-_SADDLE, _BARS = (-0.26, 0.0, 0.985), (0.40, 0.0, 0.97)
+_BARS = (0.40, 0.0, 0.97)
 
 
 def _team(jacket: Colour, stripe: Colour, helmet: Colour, number: str) -> figure.Clothes:

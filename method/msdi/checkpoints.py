@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -26,16 +25,6 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.msdi.network import Msdi
 
 _FIX = "use model.safetensors of jedyang97/Fast3R_ViT_Large_512 or naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt"
-
-
-@dataclass(frozen=True)
-class Transfer:
-    """The tensors that a file gave."""
-
-    source: str  # "fast3r" or "dust3r"
-    taken: tuple[str, ...]  # names of the network's tensors that the file gave
-    fresh: tuple[str, ...]  # names of those that it has not, which keep their values
-    left: tuple[str, ...]  # names in the file that the network does not have
 
 
 # Published name -> ours; the first pattern that matches counts. The head's names agree from `dpt.` on.
@@ -78,29 +67,26 @@ def source_of(names: Mapping[str, Tensor]) -> str | None:
     return None
 
 
-def renamed(state: Mapping[str, Tensor], source: str) -> tuple[dict[str, Tensor], tuple[str, ...]]:
-    """Return tensors under this network's names, and the names in the file that it does not have."""
+def renamed(state: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+    """Return tensors under this network's names, without those that it does not have."""
     ours: dict[str, Tensor] = {}
-    left = []
     for name, tensor in state.items():
         for pattern, replacement in _RULES[source]:
             if match := re.fullmatch(pattern, canonical_head(name)):
                 ours[match.expand(replacement)] = tensor
                 break
-        else:
-            left.append(name)
-    return ours, tuple(left)
+    return ours
 
 
-def transfer(network: Msdi, state: Mapping[str, Tensor], path: Path) -> Transfer:
-    """Take a state dict of Fast3R or DUSt3R for `network`, in place, and return what was taken.
+def transfer(network: Msdi, state: Mapping[str, Tensor], path: Path) -> None:
+    """Take a state dict of Fast3R or DUSt3R for `network`, in place; tensors that it has not keep their values.
 
     `path` is for the error. Raises UserError where the tensors are neither's, or of other sizes than the network's.
     """
     source = source_of(state)
     if source is None:
         raise problem(path, "the tensors of Fast3R or DUSt3R", f"others, such as {min(state, default='none')}", _FIX)
-    found, left = renamed(state, source)
+    found = renamed(state, source)
     own = network.state_dict()
     wanted = {n for n in own if n.startswith(_PARTS[source]) and not n.startswith(_OURS)}
     shapes = {n: tuple(t.shape) for n, t in found.items()}
@@ -112,4 +98,3 @@ def transfer(network: Msdi, state: Mapping[str, Tensor], path: Path) -> Transfer
     with torch.no_grad():
         for name, tensor in found.items():
             own[name].copy_(tensor)
-    return Transfer(source, tuple(sorted(found)), tuple(n for n in own if n not in found), left)

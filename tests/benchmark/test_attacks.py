@@ -34,7 +34,6 @@ from spike4dgs.cli import main
 from spike4dgs.method.models.saved_model import load_model
 
 HUGE = "9" * 400
-Change = Callable[[dict[str, Any]], Any]
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,6 @@ _ATLAS = Atlas(LENGTH_M + 0.1, WIDTH_M + 0.1, HEIGHT_M, 104)
 
 GLASS: Colour = (0.035, 0.045, 0.055)
 DARK: Colour = (0.03, 0.03, 0.033)
-WHITE: Colour = (0.84, 0.83, 0.80)
 
 # side outline of the roof line, bonnet and windscreen, from the back to the front
 _TOP = np.array(

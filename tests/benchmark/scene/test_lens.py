@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from spike4dgs.benchmark.scene.lens import distort, fold_radius, inside, make_distortion, nearest, resample, undistort
 
-BARREL = make_distortion([-0.2, 0.03, 0.001, -0.001, 0.0])
 LENSES = st.tuples(
     st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(-0.01, 0.01), st.floats(-0.01, 0.01), st.floats(-0.2, 0.2)
 )

@@ -12,7 +12,6 @@ from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, bytes_per_tick, open_stream, pack
 
 _RATE_HZ = 20_000.0
-_NUMPY = "numpy.unpackbits"
 _SIZES = ((1, 1), (3, 5), (8, 1), (7, 9), (13, 7), (17, 23), (400, 250))  # width, height
 UInt8 = NDArray[np.uint8]
 PIXELS = {"twin": "numpy.unpackbits", "unit": "pixels that differ"}

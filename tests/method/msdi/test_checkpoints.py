@@ -17,7 +17,7 @@ from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.variants import FIRST_TRAINING_VARIANT
 from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.method.msdi import PAPER, TINY, Msdi, MsdiConfig
-from spike4dgs.method.msdi.checkpoints import source_of, transfer
+from spike4dgs.method.msdi.checkpoints import renamed, source_of, transfer
 from spike4dgs.method.msdi.train import start_from
 from spike4dgs.method.msdi.weights import SHIPPED, WEIGHTS, Card, load_network
 
@@ -95,30 +95,32 @@ def test_the_papers_configuration_takes_all_of_fast3rs_published_shapes() -> Non
         network = Msdi(PAPER)
         state = {name: torch.empty(shape) for name, shape in shapes.items()}
     assert 640e6 < sum(t.numel() for t in state.values()) < 655e6
-    result = transfer(network, state, Path("model.safetensors"))
-    assert result.source == "fast3r"
-    assert set(result.left) == {name for name in shapes if name.startswith("downstream_head_local.")}
-    assert len(result.taken) == len(shapes) - len(result.left)
-    prefixes = {name.split(".")[0] for name in result.fresh if not name.startswith("encoder.")}
+    transfer(network, state, Path("model.safetensors"))
+    assert source_of(state) == "fast3r"
+    taken = renamed(state, "fast3r")
+    assert len(taken) == sum(not name.startswith("downstream_head_local.") for name in shapes)
+    kept = network.state_dict().keys() - taken.keys()
+    prefixes = {name.split(".")[0] for name in kept if not name.startswith("encoder.")}
     assert prefixes == {"extractor", "generator"}
-    inside = {name for name in result.fresh if name.startswith("encoder.")}
+    inside = {name for name in kept if name.startswith("encoder.")}
     assert inside == {"encoder.mix.weight", "encoder.mix.bias", "encoder.ray_embed.weight"}
 
 
 def test_the_papers_configuration_takes_dust3rs_encoder() -> None:
     with torch.device("meta"):
         network, state = Msdi(PAPER), Dust3r().state_dict()
-    result = transfer(network, {**state, "mask_token": torch.zeros(1, 1, 768)}, Path("model.safetensors"))
+    transfer(network, {**state, "mask_token": torch.zeros(1, 1, 768)}, Path("model.safetensors"))
     encoder = [n for n in state if n.split(".")[0] in ("patch_embed", "enc_blocks", "enc_norm")]
-    assert result.source == "dust3r" and len(result.taken) == len(encoder) == 24 * 12 + 4
-    assert len(result.left) == len(state) - len(encoder) + 1
-    assert {n.split(".")[0] for n in result.fresh} == {"encoder", "extractor", "fusion", "generator", "head"}
+    taken = renamed(state, "dust3r")
+    assert source_of(state) == "dust3r" and len(taken) == len(encoder) == 24 * 12 + 4
+    kept = network.state_dict().keys() - taken.keys()
+    assert {n.split(".")[0] for n in kept} == {"encoder", "extractor", "fusion", "generator", "head"}
 
 
 def test_values_have_the_right_names() -> None:
     state = random_state(fast3r_shapes(EMBED), 1)
     network, before = fresh(EMBED), fresh(EMBED).state_dict()
-    result = transfer(network, state, Path("model.safetensors"))
+    transfer(network, state, Path("model.safetensors"))
     after = network.state_dict()
     for ours, theirs in {
         "encoder.patch_embed.weight": "encoder.patch_embed.proj.weight",
@@ -135,8 +137,8 @@ def test_values_have_the_right_names() -> None:
         "head.head.4.weight": "downstream_head.dpt.head.4.weight",
     }.items():
         assert torch.equal(after[ours], state[theirs]), ours
-    assert all(torch.equal(after[name], before[name]) for name in result.fresh)
-    assert not any(torch.equal(after[name], before[name]) for name in result.taken)
+    taken = renamed(state, "fast3r")
+    assert all(torch.equal(after[name], before[name]) != (name in taken) for name in after)
     out = network((torch.rand(1, 2, 9, 16, 32) < 0.3).float())
     assert out.points.isfinite().all()
 
