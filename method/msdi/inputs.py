@@ -24,17 +24,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from spike4dgs.benchmark.errors import problem
-
 
 def shrink(spikes: Tensor, factor: int) -> Tensor:
     """Return a stream [..., T, H, W] of 0 and 1 in blocks of `factor` x `factor` pixels, sides rounded up, float32.
 
-    A block at the border has only the pixels inside. All blocks begin half charged. Raises UserError for a factor below
-    1.
+    A block at the border has only the pixels inside. All blocks begin half charged.
     """
-    if factor < 1:
-        raise problem("spikes", "a factor of 1 or more", str(factor), "give 1 to keep the size")
     if factor == 1:
         return spikes.float()
     ticks, height, width = spikes.shape[-3:]

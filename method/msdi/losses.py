@@ -36,26 +36,26 @@ ALPHA = 0.2  # weight of the confidence's logarithm, DUSt3R's
 _SMALLEST = 1e-8  # of a mean distance
 
 
-def image_loss(images: Tensor, truth: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return the mean |image - truth| over the pixels that count: all, or those of `valid` (bool); 0 if there is none.
+def image_loss(images: Tensor, truth: Tensor) -> Tensor:
+    """Return the mean |image - truth| over the pixels whose truth is finite; 0 if there is none.
 
-    `images` and `truth` have the same shape, in spikes per tick. Pixels whose truth is not finite never count.
+    `images` and `truth` have the same shape, in spikes per tick.
     """
-    counted = truth.isfinite() if valid is None else truth.isfinite() & valid
+    counted = truth.isfinite()
     # Replaced before the difference: a NaN that is masked afterwards still has a gradient of NaN.
     difference = (images - truth.where(counted, images.detach())).abs()
     return _mean(difference, counted)
 
 
-def point_loss(points: Tensor, confidence: Tensor, truth: Tensor, valid: Tensor) -> Tensor:
+def point_loss(points: Tensor, confidence: Tensor, truth: Tensor) -> Tensor:
     """Return DUSt3R's loss (eqs. 3 and 4 there) over V views: the mean of C |X / z - Xgt / zgt| - alpha log C.
 
-    `points` and `truth` [B, V, H, W, 3] are in view 0's frame; `confidence` C > 1 and `valid` (bool) are [B, V, H, W].
-    z and zgt are the mean distances of a sample's valid points to the origin, over all its views together: each
-    network output may have a scale of its own, and the views of a sample share one. The mean is over the valid pixels
-    of the batch; 0 if there is none. Points whose truth is not finite never count.
+    `points` and `truth` [B, V, H, W, 3] are in view 0's frame; `confidence` C > 1 is [B, V, H, W]. Points whose truth
+    is not finite never count. z and zgt are the mean distances of a sample's points to the origin, over all its views
+    together: each network output may have a scale of its own, and the views of a sample share one. The mean is over
+    the batch; 0 if no point counts.
     """
-    counted = valid & truth.isfinite().all(dim=-1)
+    counted = truth.isfinite().all(dim=-1)
     seen = truth.where(counted[..., None], torch.ones((), dtype=truth.dtype, device=truth.device))
     distance = torch.linalg.vector_norm(normalized(points, counted) - normalized(seen, counted), dim=-1)
     return _mean(confidence * distance - ALPHA * confidence.log(), counted)

@@ -20,24 +20,16 @@ if TYPE_CHECKING:
     from spike4dgs.method.msdi.network import Estimate
 
 
+# DUSt3R and Fast3R take 10 rounds at 5 px of 512. With a third of the points right, a sample of four is right in one
+# of 81 rounds: 10 rounds mostly miss. RANSAC stops by itself once it is sure.
+ROUNDS = 2000
+CERTAINTY = 0.9999
+REACH = 0.01  # of the image's longer side: a point within this distance of its pixel is an inlier
+LEAST_INLIERS = 0.1  # share of the points below which a pose counts as none
+LEAST_CONFIDENCE = 0.3  # quantile of a view's confidence below which its points are left out
+MOST_POINTS = 4000  # random sample of a view's points; more take longer and give the same poses
 FOCAL_ROUNDS = 10
 LEAST_POINTS = 6
-
-
-@dataclass(frozen=True)
-class PnpSettings:
-    """Numbers of the pose solver.
-
-    DUSt3R and Fast3R take 10 rounds at 5 px of 512. With a third of the points right, a sample of four is right in one
-    of 81 rounds: 10 rounds mostly miss. RANSAC stops by itself once it is sure.
-    """
-
-    rounds: int = 2000
-    certainty: float = 0.9999
-    reach: float = 0.01  # of the image's longer side: a point within this distance of its pixel is an inlier
-    least_inliers: float = 0.1  # share of the points below which a pose counts as none
-    least_confidence: float = 0.3  # quantile of a view's confidence below which its points are left out
-    most_points: int = 4000  # random sample of a view's points; more take longer and give the same poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +37,6 @@ class ViewPose:
     """A view's pose, or the reason why there is none."""
 
     w2c: Float64 | None  # [4, 4] from view 0's frame to the camera's, OpenCV axes
-    inlier_share: float  # of the points used; 0 without a pose
     focal_px: float | None  # estimated, where the intrinsics were unknown
     reason: str = ""  # why there is no pose
 
@@ -63,74 +54,50 @@ def poses_of(estimate: Estimate, intrinsics: Float64 | None, seed: int = 0) -> l
     return [solve_poses(p, c, K, seed) for p, c, K in zip(points, confidence, known, strict=True)]
 
 
-def solve_poses(
-    points: Float64,
-    confidence: Float64,
-    intrinsics: Float64 | None,
-    seed: int = 0,
-    settings: PnpSettings | None = None,
-) -> list[ViewPose]:
+def solve_poses(points: Float64, confidence: Float64, intrinsics: Float64 | None, seed: int = 0) -> list[ViewPose]:
     """Return the pose of each view from points [V, H, W, 3] in view 0's frame and their confidence [V, H, W].
 
     `intrinsics` [V, 3, 3] are in pixels. Where they are None, the focal length of view 0's points serves all views,
-    with square pixels and the principal point in the middle. View 0's pose is the identity by definition; its inlier
-    share says how well its points fit. The same seed gives the same poses. Nothing is raised for bad points: such a
-    view has no pose.
+    with square pixels and the principal point in the middle. View 0's pose is the identity by definition. The same
+    seed gives the same poses. Nothing is raised for bad points: such a view has no pose.
     """
-    settings = settings or PnpSettings()
     height, width = confidence.shape[1:]
-    chosen = [_chosen(p, c, settings, seed) for p, c in zip(points, confidence, strict=True)]
+    chosen = [_chosen(p, c, seed) for p, c in zip(points, confidence, strict=True)]
     focal = None
     if intrinsics is None:
         pixels, at = chosen[0]
         focal = focal_from_points(at, pixels - np.array([width / 2, height / 2]))
         if focal is None:
-            return [ViewPose(None, 0.0, None, "no focal length fits the points of view 0")] * len(points)
+            return [ViewPose(None, None, "no focal length fits the points of view 0")] * len(points)
         intrinsics = np.tile([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]], (len(points), 1, 1))
-    reach_px = settings.reach * max(height, width)
-    first = _inliers(np.eye(3), np.zeros(3), chosen[0][1], chosen[0][0], intrinsics[0], reach_px)
-    poses = [ViewPose(np.eye(4), float(first.mean()) if len(first) else 0.0, focal)]
+    reach_px = REACH * max(height, width)
+    poses = [ViewPose(np.eye(4), focal)]
     for (pixels, at), K in zip(chosen[1:], intrinsics[1:], strict=True):
-        poses.append(_pose(at, pixels, np.asarray(K, np.float64), focal, reach_px, seed, settings))
+        poses.append(_pose(at, pixels, np.asarray(K, np.float64), focal, reach_px, seed))
     return poses
 
 
-def _pose(
-    points: Float64,
-    pixels: Float64,
-    K: Float64,
-    focal: float | None,
-    reach_px: float,
-    seed: int,
-    settings: PnpSettings,
-) -> ViewPose:
+def _pose(points: Float64, pixels: Float64, K: Float64, focal: float | None, reach_px: float, seed: int) -> ViewPose:
     if len(points) < LEAST_POINTS:
-        return ViewPose(None, 0.0, focal, f"{len(points)} usable points, fewer than {LEAST_POINTS}")
-    found = solve_pose(points, pixels, K, seed, reach_px=reach_px, settings=settings)
+        return ViewPose(None, focal, f"{len(points)} usable points, fewer than {LEAST_POINTS}")
+    found = solve_pose(points, pixels, K, seed, reach_px=reach_px)
     if found is None:
-        return ViewPose(None, 0.0, focal, "no pose agrees with the points")
+        return ViewPose(None, focal, "no pose agrees with the points")
     share = float(_inliers(*found, points, pixels, K, reach_px).mean())
-    if share < settings.least_inliers:
-        return ViewPose(None, 0.0, focal, f"the best pose agrees with {share:.0%} of the points")
+    if share < LEAST_INLIERS:
+        return ViewPose(None, focal, f"the best pose agrees with {share:.0%} of the points")
     w2c = np.eye(4)
     w2c[:3, :3], w2c[:3, 3] = found
-    return ViewPose(w2c, share, focal)
+    return ViewPose(w2c, focal)
 
 
 def solve_pose(
-    points: Float64,
-    pixels: Float64,
-    K: Float64,
-    seed: int,
-    *,
-    reach_px: float,
-    settings: PnpSettings | None = None,
+    points: Float64, pixels: Float64, K: Float64, seed: int, *, reach_px: float
 ) -> tuple[Float64, Float64] | None:
     """Return world-to-camera (R [3, 3], t [3]) from points [N, 3] and pixels [N, 2], or None if RANSAC finds none.
 
     Points within `reach_px` of their pixel are inliers. The same seed gives the same pose.
     """
-    settings = settings or PnpSettings()
     # Points of unit size around the origin, which changes no pixel: OpenCV's thresholds assume such numbers.
     middle = np.median(points, axis=0)
     size = float(np.median(np.linalg.norm(points - middle, axis=1)))
@@ -144,9 +111,9 @@ def solve_pose(
             pixels,
             K,
             None,
-            iterationsCount=settings.rounds,
+            iterationsCount=ROUNDS,
             reprojectionError=reach_px,
-            confidence=settings.certainty,
+            confidence=CERTAINTY,
             flags=cv2.SOLVEPNP_SQPNP,
         )
         if not found or inliers is None or len(inliers) < LEAST_POINTS:
@@ -176,14 +143,14 @@ def _inliers(
     return ahead & (np.linalg.norm(uv - pixels, axis=1) <= reach_px)
 
 
-def _chosen(points: Float64, confidence: Float64, settings: PnpSettings, seed: int) -> tuple[Float64, Float64]:
+def _chosen(points: Float64, confidence: Float64, seed: int) -> tuple[Float64, Float64]:
     """Return the pixel centres [N, 2] and points [N, 3] of a view's finite points of sufficient confidence."""
     usable = np.isfinite(points).all(axis=-1) & np.isfinite(confidence)
     if usable.any():
-        usable &= confidence >= np.quantile(confidence[usable], settings.least_confidence)
+        usable &= confidence >= np.quantile(confidence[usable], LEAST_CONFIDENCE)
     v, u = np.nonzero(usable)
-    if len(v) > settings.most_points:
-        few = np.sort(np.random.default_rng(seed).permutation(len(v))[: settings.most_points])
+    if len(v) > MOST_POINTS:
+        few = np.sort(np.random.default_rng(seed).permutation(len(v))[:MOST_POINTS])
         v, u = v[few], u[few]
     return np.stack([u + 0.5, v + 0.5], axis=-1), points[v, u]
 

@@ -99,7 +99,7 @@ class Training:
             torch.manual_seed(int(draws.integers(1 << 62)))  # the numbers of the views
             found = self.network(spikes, intrinsics if known else None, sensors)
         image_l1 = image_loss(found.images, rate) / batch.gain
-        of_points = point_loss(found.points, found.confidence, points, points.isfinite().all(dim=-1))
+        of_points = point_loss(found.points, found.confidence, points)
         total = image_l1 + of_points  # they share no parameters: there is nothing to weigh
         self.adam.zero_grad()
         total.backward()

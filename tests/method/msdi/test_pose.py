@@ -10,7 +10,7 @@ from toy_world import ToyWorld
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.method.msdi import Estimate
-from spike4dgs.method.msdi.pose import PnpSettings, focal_from_points, poses_of, solve_poses
+from spike4dgs.method.msdi.pose import focal_from_points, poses_of, solve_poses
 
 WORLD = ToyWorld(width=64, height=40)
 K = np.stack([c.K for c in WORLD.cameras])
@@ -48,7 +48,7 @@ def test_exact_points_give_exact_poses_at_any_scale(scale: float) -> None:
     for pose, true in zip(poses, TRUE, strict=True):
         turn, off = errors(pose.w2c, true, scale)
         assert pose.found and pose.reason == "" and pose.focal_px is None
-        assert turn < 1e-4 and off < 1e-5 and pose.inlier_share == 1
+        assert turn < 1e-4 and off < 1e-5
 
 
 def test_noise_and_outliers_of_low_and_high_confidence() -> None:
@@ -62,7 +62,6 @@ def test_noise_and_outliers_of_low_and_high_confidence() -> None:
     for pose, true in zip(poses, TRUE, strict=True):
         turn, off = errors(pose.w2c, true)
         assert turn < 0.2 and off < 0.02
-        assert 0.55 < pose.inlier_share < 0.8  # a third of what is left is wrong
 
 
 def test_unknown_focal_length_is_found_from_view_0() -> None:
@@ -98,13 +97,11 @@ def test_bad_views_have_no_pose_and_say_why_and_leave_the_others() -> None:
     points[8, 2, 3] = np.inf
     poses = solve_poses(points, SURE, K)
     assert [p.found for p in poses] == [True, True, False, False, False, False, poses[6].found, True, True]
-    assert all(p.w2c is None and p.inlier_share == 0 and p.reason for p in poses[2:6])
+    assert all(p.w2c is None and p.reason for p in poses[2:6])
     assert poses[3].reason == "0 usable points, fewer than 6"
     for i in (1, 7, 8):
         turn, off = errors(poses[i].w2c, TRUE[i])
         assert turn < 1e-3 and off < 1e-4
-    if poses[6].found:  # whatever it is, it lies before its camera
-        assert poses[6].inlier_share > 0.1
 
 
 def test_without_any_good_point_nothing_is_raised() -> None:
@@ -112,14 +109,15 @@ def test_without_any_good_point_nothing_is_raised() -> None:
         poses = solve_poses(np.full((3, 8, 8, 3), value), np.ones((3, 8, 8)), None)
         assert [p.found for p in poses] == [False] * 3 and "focal" in poses[0].reason
     poses = solve_poses(seen()[:2], np.full((2, 40, 64), np.nan), K[:2])
-    assert poses[0].inlier_share == 0 and not poses[1].found
+    assert poses[0].found and not poses[1].found
 
 
 def test_the_same_seed_gives_the_same_poses() -> None:
     rng = np.random.default_rng(3)
-    points = seen()[:3] + 0.05 * rng.normal(size=(3, 40, 64, 3))
-    few = PnpSettings(most_points=300)
-    a, b, c = (solve_poses(points, SURE[:3], K[:3], seed, few) for seed in (0, 0, 1))
+    points = seen()[:3].repeat(2, axis=1).repeat(2, axis=2)  # more than the solver takes: the seed chooses among them
+    points += 0.05 * rng.normal(size=points.shape)
+    finer = K[:3] * [[2], [2], [1]]
+    a, b, c = (solve_poses(points, np.ones(points.shape[:3]), finer, seed) for seed in (0, 0, 1))
     for x, y, z in zip(a[1:], b[1:], c[1:], strict=True):
         assert x.found and np.array_equal(x.w2c, y.w2c) and not np.array_equal(x.w2c, z.w2c)
 

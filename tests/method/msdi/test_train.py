@@ -105,7 +105,7 @@ def test_batches_have_a_steady_number_of_views(data: Bursts) -> None:
 def test_a_step_without_a_finite_gradient_changes_nothing(data: Bursts, monkeypatch: pytest.MonkeyPatch) -> None:
     training = Training(data, TINY, FAST, "cpu", seed=3)
     before = {name: value.clone() for name, value in training.network.state_dict().items()}
-    monkeypatch.setattr("spike4dgs.method.msdi.train.point_loss", lambda p, c, t, v: (c * float("inf")).sum())
+    monkeypatch.setattr("spike4dgs.method.msdi.train.point_loss", lambda p, c, t: (c * float("inf")).sum())
     training.train_step()
     assert training.step == 1
     for name, value in training.network.state_dict().items():
