@@ -21,21 +21,9 @@ def images(batch: int, height: int, width: int, seed: int = 0) -> tuple[torch.Te
     return a, (a + 0.2 * torch.randn(batch, height, width, generator=g)).clamp(0, 1.5)
 
 
-@pytest.mark.parametrize("shape", [(1, 125, 200), (3, 24, 40), (2, 7, 5), (1, 1, 1), (2, 11, 33)])
-def test_value_and_gradient_equal_the_float64_twin(shape: tuple[int, int, int]) -> None:
-    a, b = images(*shape)
-    fast, slow = a.clone().requires_grad_(), a.double().requires_grad_()
-    value, expected = ssim(fast, b), ssim_reference(slow, b.double())
-    (3 * value).backward()
-    (3 * expected).backward()
-    assert abs(value.item() - expected.item()) < 1e-6
-    assert fast.grad is not None and slow.grad is not None
-    assert (fast.grad - slow.grad).norm() <= 1e-5 * slow.grad.norm()
-
-
 @pytest.mark.parametrize("delta", [0.0, 1e-3, 0.02, 10.0])
 @pytest.mark.parametrize("w", [0.0, 0.2, 1.0])
-@pytest.mark.parametrize("shape", [(2, 125, 200), (2, 7, 5), (1, 1, 1)])
+@pytest.mark.parametrize("shape", [(2, 125, 200), (3, 24, 40), (2, 11, 33), (2, 7, 5), (1, 1, 1)])
 def test_the_loss_equals_its_two_terms(shape: tuple[int, int, int], w: float, delta: float) -> None:
     a, b = images(*shape)
     b[..., 0] = a[..., 0]  # |d| has no gradient at 0
