@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lit_streams import RATE_HZ, lit
 
 from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
@@ -13,7 +14,7 @@ from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.intervals import INTERVALS
 from spike4dgs.method.images.light import Light, PixelLight, estimate_light, steady
 
-N, HEIGHT, WIDTH, RATE_HZ = 400, 48, 80, 20_000.0
+N, HEIGHT, WIDTH = 400, 48, 80
 
 
 def course(depth: float, hz: float = 100.0, n: int = N) -> np.ndarray:
@@ -26,16 +27,7 @@ def course(depth: float, hz: float = 100.0, n: int = N) -> np.ndarray:
 def stream_in(light: np.ndarray, moving: float = 0.0, seed: int = 0) -> SpikeStream:
     """Return the spikes of a scene of random rates under a light; a share of its columns shows a texture that moves."""
     rng = np.random.default_rng(seed)
-    rates = rng.uniform(0.05, 0.5, (HEIGHT, WIDTH))
-    texture = rng.uniform(0.05, 0.5, (HEIGHT, WIDTH + N))
-    charge, spikes = rng.uniform(0, 1, (HEIGHT, WIDTH)), []
-    columns = np.arange(WIDTH) < moving * WIDTH
-    for k, factor in enumerate(light):
-        shown = np.where(columns, texture[:, k // 4 : k // 4 + WIDTH], rates)
-        charge += shown * factor
-        spikes.append(charge >= 1)
-        charge -= spikes[-1]
-    return SpikeStream(pack(np.stack(spikes).astype(np.uint8)), WIDTH, HEIGHT, RATE_HZ)
+    return lit(light, rng.uniform(0.05, 0.5, (HEIGHT, WIDTH)), rng, moving=moving)
 
 
 @pytest.mark.parametrize("moving", [0.0, 0.6])

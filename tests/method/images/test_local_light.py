@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lit_streams import RATE_HZ, lit
 
 from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.scene.camera_state import Clock
@@ -13,7 +14,7 @@ from spike4dgs.method.images.intervals import INTERVALS, intervals
 from spike4dgs.method.images.light import Light, PixelLight, estimate_light
 from spike4dgs.method.images.local_light import lamp, layers, shared
 
-N, HEIGHT, WIDTH, RATE_HZ = 400, 48, 80, 20_000.0
+N, HEIGHT, WIDTH = 400, 48, 80
 
 
 def flashes() -> Float64:
@@ -33,15 +34,8 @@ def world(seed: int = 0) -> tuple[Float64, Float64]:
 
 def seen(course: Float64, seed: int = 0, moving: float = 0.0) -> SpikeStream:
     """Return the spikes of that world without noise; a share of its columns shows a texture that moves."""
-    (rates, shares), rng = world(seed), np.random.default_rng(seed + 100)
-    texture = rng.uniform(0.05, 0.3, (HEIGHT, WIDTH + N))
-    charge, spikes = rng.uniform(0, 1, (HEIGHT, WIDTH)), []
-    columns = np.arange(WIDTH) < moving * WIDTH
-    for k, factor in enumerate(course):
-        charge += np.where(columns, texture[:, k // 4 : k // 4 + WIDTH], rates) * (1 + shares * (factor - 1))
-        spikes.append(charge >= 1)
-        charge -= spikes[-1]
-    return SpikeStream(pack(np.stack(spikes).astype(np.uint8)), WIDTH, HEIGHT, RATE_HZ)
+    rates, shares = world(seed)
+    return lit(course, rates, np.random.default_rng(seed + 100), shares, moving)
 
 
 def gathered(course: Float64) -> Float64:

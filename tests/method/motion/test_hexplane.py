@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from gaussian_clouds import cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional
@@ -30,14 +31,7 @@ def rng(seed: int = 0) -> torch.Generator:
 
 
 def gaussians(n: int = 50) -> Gaussians:
-    g = rng(1)
-    return Gaussians(
-        means=torch.rand(n, 3, generator=g) * 2 - 1,
-        log_scales=torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        logits=torch.randn(n, generator=g),
-        colors=torch.rand(n, 1, generator=g),
-    )
+    return replace(cloud(n), extra={})
 
 
 def motion() -> HexPlaneMotion:

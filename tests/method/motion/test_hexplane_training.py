@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gaussian_clouds import cloud
 from toy_world import ToyWorld
 
 from spike4dgs.method.gaussians.density import DensitySettings
@@ -32,14 +33,7 @@ PLANES = HexPlaneSettings(mlp_width=8, features=4)
 
 
 def gaussians(n: int = 40) -> Gaussians:
-    rng = torch.Generator().manual_seed(1)
-    return Gaussians(
-        means=torch.rand(n, 3, generator=rng),
-        log_scales=torch.full((n, 3), -2.5),
-        quats=torch.randn(n, 4, generator=rng),
-        logits=torch.zeros(n),
-        colors=torch.rand(n, 1, generator=rng),
-    )
+    return replace(cloud(n), extra={})
 
 
 def trainer(density: DensitySettings = DENSITY, planes: HexPlaneSettings = PLANES) -> Trainer:

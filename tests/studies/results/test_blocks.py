@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import made_records
 import numpy as np
 import pytest
 from PIL import Image
@@ -70,13 +71,7 @@ GROUP = Group("made", "Made", SCENES, (Row(OURS, 2, "here", True), Row("a"), Row
 def record(row: str, scene: str, moving: float, seed: int = 0, **changes: Any) -> dict[str, Any]:
     metrics = {"psnr": moving + 2, "ssim": 0.97, "psnr_dynamic": moving, "ssim_dynamic": 0.96, "flip": 0.05}
     metrics["psnr_covisible"] = moving + 3
-    return {
-        "row": row,
-        "scene": scene,
-        "revision": "0123456789ab",
-        "seed": seed,
-        "budget": 1.0,
-        "split": "center",
+    return made_records.record(row=row, scene=scene, seed=seed) | {
         "commit": "c0ffee000000",
         "code": "00000000000b" if row.startswith("spike4dgs") else "00000000000a",
         "tuned_on": "here" if row == OURS else "elsewhere",
@@ -85,11 +80,10 @@ def record(row: str, scene: str, moving: float, seed: int = 0, **changes: Any) -
         "metrics": metrics,
         "fit_seconds": 30.4,
         "render_fps": 120.6,
-        "peak_memory_mb": 900.0,
         "quiet": True,
         "cpu": "A processor, 2 cores",
-        "error": None,
-    } | changes
+        **changes,
+    }
 
 
 def made() -> list[dict[str, Any]]:
