@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,12 @@ class Camera:
         """
         xy = np.stack([(uv[..., 0] - self.cx) / self.fx, (uv[..., 1] - self.cy) / self.fy], axis=-1)
         return undistort(xy, self.distortion) if self.distortion else xy
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """Return the same view in `width` x `height` pixels, which need not be square."""
+        x, y = width / self.width, height / self.height
+        fx, fy, cx, cy = self.fx * x, self.fy * y, self.cx * x, self.cy * y
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def look_at(id: str, origin: Float64, target: Float64, up: Float64, *, focal: float, width: int, height: int) -> Camera:

@@ -8,7 +8,7 @@ lenses, textures, light and calibration; its spikes, its rate and its steps of t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -133,10 +133,7 @@ def _middle(instant: int, hold: int) -> int:
 
 def _shrunk(camera: Camera, width: int) -> Camera:
     """Return the camera whose pixels average those of `camera`; the other side is rounded to whole pixels."""
-    height = max(1, round(camera.height * width / camera.width))
-    x, y = width / camera.width, height / camera.height
-    c = camera
-    return replace(c, width=width, height=height, fx=c.fx * x, fy=c.fy * y, cx=c.cx * x, cy=c.cy * y)
+    return camera.scaled(width, max(1, round(camera.height * width / camera.width)))
 
 
 def _light(image: UInt8, camera: Camera, linear: bool) -> Float32:

@@ -69,7 +69,7 @@ def find_range(cameras: Sequence[Camera], images: Float32, settings: SweepSettin
     Everything is kept where nothing matches.
     """
     planes, step = full_range(cameras, settings), inverse_depth_step(cameras, settings.parallax_step_px)
-    half = [half_size(c) for c in cameras]
+    half = [c.scaled(c.width // 2, c.height // 2) for c in cameras]
     small = np.stack([cv2.resize(p, (half[0].width, half[0].height), interpolation=cv2.INTER_AREA) for p in images])
     maps = sweep_all(half, small, planes[::2], settings=settings)
     found = np.concatenate([m.inverse[agreed(half, maps, i, settings)] for i, m in enumerate(maps)])
@@ -77,13 +77,6 @@ def find_range(cameras: Sequence[Camera], images: Float32, settings: SweepSettin
         return planes
     low, high = np.quantile(found, [0.002, 0.998])
     return planes[(planes >= low - 6 * step) & (planes <= high + 6 * step)]
-
-
-def half_size(camera: Camera) -> Camera:
-    """Return the same view with half as many pixels each way."""
-    c, width, height = camera, camera.width // 2, camera.height // 2
-    x, y = width / c.width, height / c.height
-    return Camera(c.id, width, height, c.fx * x, c.fy * y, c.cx * x, c.cy * y, c.R, c.t)
 
 
 def plane_homographies(reference: Camera, other: Camera, inverse_depths: Sequence[float]) -> Iterator[Float64]:

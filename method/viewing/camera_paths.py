@@ -126,6 +126,4 @@ def resized(camera: Camera, scale: float) -> Camera:
     The rounding stretches a view by a pixel at most.
     """
     width, height = (max(2, 2 * round(scale * n / 2)) for n in (camera.width, camera.height))
-    x, y = width / camera.width, height / camera.height
-    fx, fy, cx, cy = x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy
-    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+    return camera.scaled(width, height)

@@ -51,6 +51,16 @@ def worst_px(a: Camera, b: Camera, points: np.ndarray) -> float:
     return float(np.abs(a.project(points)[0] - b.project(points)[0]).max())
 
 
+@given(cameras(), st.integers(1, 900), st.integers(1, 900))
+def test_a_scaled_camera_sees_the_same_points(camera: Camera, width: int, height: int) -> None:
+    bent = dataclasses.replace(camera, distortion=(0.01, 0.0, 0.001, 0.0, 0.0))
+    small = bent.scaled(width, height)
+    assert (small.id, small.width, small.height) == (camera.id, width, height)
+    points = seen_points(camera)
+    expected = bent.project(points)[0] * (width / camera.width, height / camera.height)
+    np.testing.assert_allclose(small.project(points)[0], expected, rtol=1e-9, atol=1e-6)
+
+
 @given(cameras())
 def test_projection_is_the_textbook_product(camera: Camera) -> None:
     points = seen_points(camera)

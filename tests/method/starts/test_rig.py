@@ -20,7 +20,6 @@ from spike4dgs.method.starts.plane_sweep import (
     agreed,
     find_range,
     full_range,
-    half_size,
     lift,
     plane_homographies,
     sweep,
@@ -44,12 +43,6 @@ def test_homography_maps_pixels_as_projecting_through_the_plane_does():
         points = a.unproject(uv, np.full(20, 1 / inverse))
         mapped = np.column_stack([uv, np.ones(20)]) @ next(plane_homographies(a, b, [inverse])).T
         assert np.allclose(mapped[:, :2] / mapped[:, 2:], b.project(points)[0], atol=1e-9)
-
-
-def test_half_size_camera_sees_the_same_points_at_half_the_coordinates():
-    c = WORLD.cameras[2]
-    points = np.random.default_rng(0).normal(size=(10, 3))
-    assert np.allclose(half_size(c).project(points)[0], c.project(points)[0] / 2)
 
 
 def test_lifted_pixels_project_back_to_their_centres():
