@@ -7,7 +7,7 @@ their own, and the order of the methods is compared.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files as package_files
@@ -214,10 +214,14 @@ def ranks(values: Sequence[float | None], metric: Metric) -> list[int | None]:
 
 
 def kendall_tau(rows: Sequence[Mapping[str, Any]], metric: str) -> float | None:
-    """Return Kendall's tau-b between the measured and the published order of the methods; None for fewer than two."""
+    """Return Kendall's tau-b between the measured and the published order of the methods; see `tau_of`."""
+    return tau_of((r["mean"][metric]["value"], r["mean"][metric]["published"]) for r in rows)
+
+
+def tau_of(pairs: Iterable[tuple[float | None, float | None]]) -> float | None:
+    """Return Kendall's tau-b of the pairs without None; None for fewer than two, and where all are equal."""
     from scipy.stats import kendalltau
 
-    pairs = [(r["mean"][metric]["value"], r["mean"][metric]["published"]) for r in rows]
     known = [(a, b) for a, b in pairs if a is not None and b is not None]
     if len(known) < 2:
         return None

@@ -11,6 +11,7 @@ from functools import partial
 
 from spike4dgs.baselines.images.published.makers import MAKERS as PUBLISHED
 from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark.reports.paper_tables import tau_of
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.weights import WeightsError
@@ -93,12 +94,8 @@ def images_block(records: Sequence[Record]) -> list[str]:
 
 
 def _agreement(rows: dict[str, MeasuredRow]) -> str:
-    from scipy.stats import kendalltau
-
-    both = [(row.mean("psnr"), TABLE_6[maker][1]) for maker, row in rows.items() if maker in TABLE_6]
-    if len(both) < 2:
-        return ""
-    return f"Kendall's tau with the published order of PSNR: {kendalltau(*zip(*both, strict=True)).statistic:.2f}. "
+    tau = tau_of((row.mean("psnr"), TABLE_6[maker][1]) for maker, row in rows.items() if maker in TABLE_6)
+    return "" if tau is None else f"Kendall's tau with the published order of PSNR: {tau:.2f}. "
 
 
 def _scores(row: MeasuredRow) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from statistics import fmean
 
 from spike4dgs.benchmark.metrics.table import METRICS
-from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published, ranks
+from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published, ranks, tau_of
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, of_group, provenance
 from spike4dgs.studies.results.changes import change_text
@@ -53,8 +53,6 @@ def _compared(
     table: PublishedTable, rows: Sequence[MeasuredRow], metric: str, digits: int
 ) -> tuple[list[list[str]], str]:
     """Return for each row its mean, the published one, and both ranks; and Kendall's tau, if there are two rows."""
-    from scipy.stats import kendalltau
-
     ours, theirs = [row.mean(metric) for row in rows], [table.mean(row.name, metric) for row in rows]
     known = [mean if printed is not None else None for mean, printed in zip(ours, theirs, strict=True)]
     parts = zip(ours, theirs, ranks(known, METRICS[metric]), ranks(theirs, METRICS[metric]), strict=True)
@@ -64,10 +62,8 @@ def _compared(
         else [f"{mean:.{digits}f}", f"{printed:.{digits}f}", f"{rank} / {printed_rank}"]
         for mean, printed, rank, printed_rank in parts
     ]
-    pairs = [(a, b) for a, b in zip(known, theirs, strict=True) if a is not None]
-    if len(pairs) < 2:
-        return column, ""
-    return column, f"{METRICS[metric].title} {kendalltau(*zip(*pairs, strict=True)).statistic:.2f}"
+    tau = tau_of(zip(known, theirs, strict=True))
+    return column, "" if tau is None else f"{METRICS[metric].title} {tau:.2f}"
 
 
 def given_row(name: str) -> str:
