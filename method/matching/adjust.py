@@ -72,11 +72,11 @@ class _Linear:
     slope: Float64  # [M, 2, 3] d offset / dp
 
 
-def adjust(array: Array, tracks: Tracks, *, focal: bool = False, rounds: int = 4, evaluations: int = 12) -> Adjusted:
+def adjust(array: Array, tracks: Tracks, *, focal: bool = False, rounds: int = 4) -> Adjusted:
     """Return the array that explains the tracks best, from a first one; with `focal` all views' focal length too."""
     weights = _weights_at(array, tracks)
     for _ in range(rounds):
-        array, w = _one_round(array, tracks, weights, focal, evaluations)
+        array, w = _one_round(array, tracks, weights, focal)
         errors = np.linalg.norm(_sights(array, tracks, w, np.ones_like(weights)).offset, axis=1)
         weights = _cauchy(errors)
     if np.median(w) < 0:  # centres and depths may change their signs together, and nothing else changes
@@ -99,7 +99,7 @@ def _cauchy(errors: Float64) -> Float64:
     return np.asarray(1 / (1 + (errors / wide) ** 2))
 
 
-def _one_round(array: Array, tracks: Tracks, weights: Float64, focal: bool, evaluations: int) -> tuple[Array, Float64]:
+def _one_round(array: Array, tracks: Tracks, weights: Float64, focal: bool) -> tuple[Array, Float64]:
     unknowns = 6 * (len(array.R) - 1) + focal
     kept: dict[str, Any] = {}
 
@@ -119,7 +119,7 @@ def _one_round(array: Array, tracks: Tracks, weights: Float64, focal: bool, eval
         here, w, sights = at(x)
         return np.concatenate([_projected(here, tracks, w, sights, x, focal), _gauge_row(here, unknowns)])
 
-    found = least_squares(residuals, np.zeros(unknowns), jacobian, method="lm", max_nfev=evaluations)
+    found = least_squares(residuals, np.zeros(unknowns), jacobian, method="lm", max_nfev=12)
     here, w, _ = at(found.x)
     return here, w
 

@@ -21,8 +21,8 @@ from spike4dgs.benchmark.scene.lens import Distortion, bend, fold_radius, make_d
 FRUSTUM_MARGIN = 0.3  # the projection is linearised at most this fraction of the half image outside of it
 
 
-def lens_rows(cameras: Sequence[Camera], device: torch.device | str, dtype: torch.dtype) -> Tensor | None:
-    """Return the lenses [C, 10] of cameras; None where all are pinholes.
+def lens_rows(cameras: Sequence[Camera], device: torch.device | str) -> Tensor | None:
+    """Return the lenses [C, 10] of cameras, float64; None where all are pinholes.
 
     Raises UserError for a lens whose model does not hold up to the image's corners.
     """
@@ -32,7 +32,7 @@ def lens_rows(cameras: Sequence[Camera], device: torch.device | str, dtype: torc
     for camera, row in zip(cameras, rows, strict=True):
         if not np.isfinite(row[5:9]).all():
             check_lens(camera, "lens distortion")
-    return torch.tensor(rows, dtype=dtype, device=device)
+    return torch.tensor(rows, dtype=torch.float64, device=device)
 
 
 @lru_cache(maxsize=256)

@@ -108,9 +108,7 @@ class Views:
         return self.w2c.shape[0]
 
     @classmethod
-    def from_cameras(
-        cls, cameras: Sequence[Camera], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
-    ) -> Views:
+    def from_cameras(cls, cameras: Sequence[Camera], device: torch.device | str = "cpu") -> Views:
         """Stack calibrated cameras. float64 costs nothing here and keeps worlds far from their origin sharp.
 
         Raises UserError for cameras of several sizes, and for a lens whose model does not hold up to the corners.
@@ -118,9 +116,9 @@ class Views:
         sizes = sorted({(c.width, c.height) for c in cameras})
         if len(sizes) != 1:
             raise problem("cameras", "one image size", f"{sizes}", "render the cameras of each size on their own")
-        w2c = torch.stack([torch.as_tensor(c.w2c, dtype=dtype) for c in cameras]).to(device)
-        K = torch.stack([torch.as_tensor(c.K, dtype=dtype) for c in cameras]).to(device)
-        return cls(w2c, K, *sizes[0], lens_rows(cameras, device, dtype))
+        w2c = torch.stack([torch.as_tensor(c.w2c, dtype=torch.float64) for c in cameras]).to(device)
+        K = torch.stack([torch.as_tensor(c.K, dtype=torch.float64) for c in cameras]).to(device)
+        return cls(w2c, K, *sizes[0], lens_rows(cameras, device))
 
     def some(self, chosen: Sequence[int]) -> Views:
         """Return some of the views, in the order of `chosen`."""

@@ -86,7 +86,7 @@ class ImageClip:
     def mean(self, window: int | None = None) -> Float32:
         """Return a mean; see `Clip`."""
         images = self.images.mean(axis=0) if window is None else self.images[window]
-        return _marked(self.scene, undistorted(self.scene, images, unseen=None))
+        return _marked(self.scene, undistorted(self.scene, images))
 
     def moving(self, windows: slice = _WHOLE) -> list[Mask]:
         """Return what changes; see `Clip`."""
@@ -102,7 +102,7 @@ def window_means(scene: TrainingScene, start: int, stop: int, flat_field: bool) 
         means = np.stack([c.radiance(r) for c, r in zip(scene.calibrations, rates, strict=True)])
     else:
         means = np.asarray(rates / white_rates(scene).astype(np.float32), np.float32)
-    return undistorted(scene, means, unseen=None)
+    return undistorted(scene, means)
 
 
 def white_rates(scene: TrainingScene) -> Float64:

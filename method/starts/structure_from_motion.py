@@ -204,7 +204,7 @@ def clip_means(scene: TrainingScene) -> Float32:
     ticks = min(scene.n_ticks, 65535)
     counts = [gathered(s.counts(0, ticks).astype(np.float32), s.dead_ticks / ticks) for s in scene.streams]
     means = np.asarray(np.stack(counts) / (ticks * white_rates(scene)).astype(np.float32), np.float32)
-    return undistorted(scene, means, unseen=None)
+    return undistorted(scene, means)
 
 
 def map_views(

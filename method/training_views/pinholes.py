@@ -11,7 +11,6 @@ whole field of view is in it, and NaN where the camera sees nothing. `with_lense
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, wraps
@@ -110,10 +109,10 @@ def lenses_of(scene: TrainingScene) -> tuple[Lens, ...]:
     return scene.lenses if isinstance(scene, PinholeScene) else ()
 
 
-def undistorted(scene: TrainingScene, images: Float32, unseen: float | None = math.nan) -> Float32:
+def undistorted(scene: TrainingScene, images: Float32) -> Float32:
     """Return images [..., C, h, w] of the pinholes from those of the streams' cameras [..., C, H, W].
 
-    Pixels that a camera does not see are `unseen`; None repeats the image's border there.
+    Pixels that a camera does not see repeat the image's border.
     """
     lenses = lenses_of(scene)
     if not lenses:
@@ -124,8 +123,6 @@ def undistorted(scene: TrainingScene, images: Float32, unseen: float | None = ma
     for c, lens in enumerate(lenses):
         for k, image in enumerate(flat[:, c]):
             out[k, c] = resample(image, lens.to_camera)
-            if unseen is not None:
-                out[k, c][~lens.seen] = unseen
     return out.reshape(*images.shape[:-2], height, width)
 
 

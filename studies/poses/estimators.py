@@ -140,7 +140,7 @@ def _images(scene: TrainingScene, images: str) -> Float32:
     if images == FLAT:
         return window_means(scene, 0, scene.n_ticks, flat_field=True)
     made = [IMAGES[images](s, [scene.n_ticks // 2], scene.radiance_gain) for s in scene.streams]
-    return undistorted(scene, np.concatenate(made), unseen=None)
+    return undistorted(scene, np.concatenate(made))
 
 
 def measure_poses(scene: TrainingScene, images: Float32, name: str, seed: int, *, calibrated: bool) -> Row:

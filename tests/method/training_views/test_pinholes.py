@@ -78,12 +78,8 @@ def test_images_go_to_the_pinhole_and_back(lens: tuple[float, ...]) -> None:
     straight = undistorted(scene, images[None])[0]
     expected, seen = np.stack([wave(c) for c in scene.cameras]), seen_pixels(scene)
     assert seen is not None
-    np.testing.assert_array_equal(np.isfinite(straight), seen)
-    inner = np.stack(seen)
-    assert np.sqrt(np.mean((straight - expected)[inner] ** 2)) < 3e-3
-    whole = undistorted(scene, images, unseen=None)
-    assert np.isfinite(whole).all()
-    np.testing.assert_array_equal(whole[inner], straight[inner])
+    assert np.sqrt(np.mean((straight - expected)[np.stack(seen)] ** 2)) < 3e-3
+    assert np.isfinite(straight).all()
     back = Waves().render(cameras[0], 0.0)
     assert back.shape == images[0].shape and np.abs(back - images[0]).max() < 5e-3
     assert np.sqrt(np.mean((back - images[0]) ** 2)) < 5e-4
