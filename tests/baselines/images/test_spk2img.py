@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 from slow_images import stream_of
 from small_scenes import GAIN, HEIGHT, WIDTH, write_small_scene
 
 from spike4dgs.baselines.images.spk2img import maker
-from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, load_network, reconstruct
+from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, load_network
 from spike4dgs.baselines.images.spk2img.network import Reconstruction, Spk2ImgNet
 from spike4dgs.baselines.images.spk2img.train import (
     Example,
@@ -216,18 +215,6 @@ def test_hidden_scenes_are_not_trained_on(small_scene: Path, tmp_path: Path) -> 
         train_spk2img(scenes=(small_scene,), steps=0, out=tmp_path / "out")
 
 
-def test_weights_survive_as_half_floats(tmp_path: Path) -> None:
-    network, path = Spk2ImgNet(4), tmp_path / "w.safetensors"
-    card = Card(4, 7, 1, ("a@0",), {"b": 31.5})
-    WEIGHTS.save(path, network, card)
-    assert WEIGHTS.read_card(path) == card
-    loaded = load_network(path, "cpu")
-    for name, value in network.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value.half().float())
-    rate = reconstruct(loaded, stream_of(np.ones((50, 6, 9), np.uint8)), 25)
-    assert rate.shape == (6, 9) and rate.dtype == np.float32
-
-
 def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stream = stream_of(np.ones((50, 6, 9), np.uint8))
     monkeypatch.setenv(WEIGHTS.variable, str(tmp_path / "none.safetensors"))
@@ -239,20 +226,13 @@ def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.Monk
         IMAGES["spk2img"](stream, [25], GAIN)
 
 
-def test_foreign_and_damaged_weights_are_refused(tmp_path: Path) -> None:
-    foreign = tmp_path / "foreign.safetensors"
-    safetensors.torch.save_file({"x": torch.zeros(3)}, foreign)
-    with pytest.raises(UserError, match="expected metadata spike4dgs-spk2img/1, found none"):
-        load_network(foreign, "cpu")
+def test_weights_of_another_width_than_their_card_says_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
-    WEIGHTS.save(path, Spk2ImgNet(4), Card(8, 7, 1, (), {}))  # the card says 8
+    WEIGHTS.save(path, Spk2ImgNet(4), Card(8, 7, 1, (), {}))
     with pytest.raises(
         UserError, match=r"parameters of width 8, found \d+ other tensors, the first align\S+ \(4,\); t"
     ):
         load_network(path, "cpu")
-    path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(UserError, match="expected weights of Spk2ImgNet, found damaged data"):
-        WEIGHTS.read_card(path)
 
 
 def test_the_weights_have_learnt_to_leave_out_what_a_sensor_has_in_the_dark() -> None:

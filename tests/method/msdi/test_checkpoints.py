@@ -193,10 +193,8 @@ def test_weights_come_back_with_their_card(tmp_path: Path) -> None:
     assert WEIGHTS.read_card(path) == CARD
     loaded = load_network(path, "cpu")
     assert not loaded.training and not any(p.requires_grad for p in loaded.parameters())
-    x = (torch.rand(1, 3, 9, 16, 32) < 0.4).float()
-    with torch.no_grad():
-        a, b = network(x), loaded(x)
-    assert (a.points - b.points).abs().max() < 0.01 * a.points.abs().max()
+    for name, value in network.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value.half().float()), name
     assert path.stat().st_size < 2.5 * sum(p.numel() for p in network.parameters()) + 20_000
 
 
