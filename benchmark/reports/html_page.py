@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
@@ -51,7 +52,8 @@ tr.marked > * { font-weight: 600; background: var(--panel); }
 .facts th { white-space: nowrap; } .facts td { overflow-wrap: anywhere; }
 .grid { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); gap: 1rem 1.5rem; }
 figure { margin: 0; min-width: 0; max-width: 38rem; }
-figure svg { display: block; width: 100%; height: auto; }
+img, video { max-width: 100%; height: auto; }
+figure svg, figure img { display: block; width: 100%; height: auto; }
 .legend { display: flex; flex-wrap: wrap; gap: .1rem .9rem; list-style: none; margin: 0; padding: 0; }
 .legend { font-size: .85rem; }
 .swatch { display: inline-block; width: .8rem; height: .8rem; border-radius: 50%; margin-right: .3rem; }
@@ -164,8 +166,13 @@ def wide(content: Html) -> Html:
 
 
 def figure(picture: Html, caption: str) -> Html:
-    """Return a picture with a caption, such as a chart."""
+    """Return a picture with a caption, such as a chart or an `image`."""
     return Html(f"<figure>{picture}<figcaption>{text(caption)}</figcaption></figure>")
+
+
+def image(png: bytes, what: str) -> Html:
+    """Return a PNG inside the page; `what` is said where it cannot be seen."""
+    return Html(f'<img alt="{escape(what)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">')
 
 
 def grid(parts: Iterable[Html]) -> Html:

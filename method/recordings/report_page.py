@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -13,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.figure import new_figure
+from spike4dgs.benchmark.reports.html_page import Html, bullets, facts, image, paragraph, section, table, write_page
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera, array_axes
 from spike4dgs.method.recordings.comparison import Comparison, mean_residual, residuals
@@ -24,24 +23,6 @@ from spike4dgs.method.recordings.held_out import SHOWN, HeldOutScores
 from spike4dgs.method.recordings.self_calibrated import Calibrated
 
 ABOVE, BEHIND = (0, 1), (0, 2)  # of right, forward and up, the axes that a plot shows
-
-_CSS = """
-:root { color-scheme: light dark; }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
-body { overflow-wrap: break-word; } code, .facts td { overflow-wrap: anywhere; }
-h1 { font-size: 1.6rem; margin-bottom: 0; } h2 { font-size: 1.2rem; margin-top: 2rem; }
-.scroll { overflow-x: auto; font-size: 13px; } table { border-collapse: collapse; }
-th, td { padding: .2rem .6rem .2rem 0; text-align: right; border-bottom: 1px solid #8884; white-space: nowrap; }
-th { font-weight: 600; } th:first-child, td:first-child, .facts td { text-align: left; }
-.facts td { white-space: normal; }
-.facts td:first-child { white-space: nowrap; font-weight: 600; vertical-align: top; }
-img, video { max-width: 100%; height: auto; background: #fff; }
-@media (max-width: 40rem) {
-  body { margin: 1rem auto; } ul { padding-left: 1.2rem; } .facts, .facts tbody { display: block; }
-  .facts tr { display: block; padding: .3rem 0; border-bottom: 1px solid #8884; }
-  .facts td { display: block; border: 0; padding: 0; }
-}
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,42 +46,50 @@ class Report:
 def write_report(path: Path, report: Report, sheet: Path) -> None:
     """Write the page; `sheet` is the PNG that it embeds."""
     about, maker = report.about, report.found.maker
-    title = f"{about.name} on {about.scene}"
     slow = f"the video is {report.slow_motion:.0f} times slower than the world"
+    sheet_image = image(sheet.read_bytes(), "training views")
     parts = [
-        f"<h1>{escape(title)}</h1>",
-        f"<p>Fitted {escape(about.created)}. Files: <code>model.safetensors</code>, <code>sheet.png</code>, "
-        f"<code>{escape(report.video)}</code>.</p>",
-        _facts_table(_summary(report)),
-        f"<h2>Notes</h2>{_list([*report.checked.recording.notes, slow])}",
-        "<h2>Video</h2>",
-        f'<video src="{escape(report.video)}" controls loop muted playsinline></video>',
-        "<h2>Training views</h2>",
-        f"<p>The {escape(maker)} image made from the spikes, the model's render, and their absolute "
-        "difference, at three times. Pixels that were left out are white in the difference.</p>",
-        f'<a href="{escape(sheet.name)}">{_image(sheet.read_bytes(), "training views")}</a>',
-        "<h2>Cameras</h2>",
-        _cameras_table(report),
-        f"<p>Rates are spikes per tick. The residual is the PSNR of the model's renders against the {maker} "
-        "images of the same camera. It is a residual of the fit and not a score: the model has seen these images, and "
-        "their noise is in it. Dead pixels never fire under uniform light, hot ones fire in the dark five times as "
-        "often as the median pixel, the rate of flickering ones is not steady. Without recordings of light and "
-        "darkness these are the pixels that differ from all of their neighbours. The gain is that of the camera "
-        "beside the array's. A clock is given beside the mean of all, at the middle of the clip, with its standard "
-        "error; a pose's error is the median distance of features from their points' projections, with the poses as "
-        "they were given.</p>",
-        _held_out(report.judged) if report.judged else "",
-        "<h2>Poses</h2>",
-        f"<p>{escape(report.poses[0].upper() + report.poses[1:])}.</p>",
-        _image(poses_plot(about.cameras, report.checked.given), "the array from above and from behind"),
-        "<h2>Program</h2>",
-        _facts_table(_program(report)),
+        paragraph(f"Fitted {about.created}. Files: `model.safetensors`, `sheet.png`, `{report.video}`."),
+        facts(_summary(report)),
+        section("Notes", [bullets([*report.checked.recording.notes, slow])]),
+        section("Video", [Html(f'<video src="{escape(report.video)}" controls loop muted playsinline></video>')]),
+        section(
+            "Training views",
+            [
+                paragraph(
+                    f"The {maker} image made from the spikes, the model's render, and their absolute difference, at "
+                    "three times. Pixels that were left out are white in the difference."
+                ),
+                Html(f'<a href="{escape(sheet.name)}">{sheet_image}</a>'),
+            ],
+        ),
+        section(
+            "Cameras",
+            [
+                _cameras_table(report),
+                paragraph(
+                    f"Rates are spikes per tick. The residual is the PSNR of the model's renders against the {maker} "
+                    "images of the same camera. It is a residual of the fit and not a score: the model has seen these "
+                    "images, and their noise is in it. Dead pixels never fire under uniform light, hot ones fire in "
+                    "the dark five times as often as the median pixel, the rate of flickering ones is not steady. "
+                    "Without recordings of light and darkness these are the pixels that differ from all of their "
+                    "neighbours. The gain is that of the camera beside the array's. A clock is given beside the mean "
+                    "of all, at the middle of the clip, with its standard error; a pose's error is the median "
+                    "distance of features from their points' projections, with the poses as they were given."
+                ),
+            ],
+        ),
+        *([_held_out(report.judged)] if report.judged else []),
+        section(
+            "Poses",
+            [
+                paragraph(f"{report.poses[0].upper() + report.poses[1:]}."),
+                image(poses_plot(about.cameras, report.checked.given), "the array from above and from behind"),
+            ],
+        ),
+        section("Program", [facts(_program(report))]),
     ]
-    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{_CSS}</style>'
-    head += '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    write_text(
-        path, f'<!doctype html><html lang="en"><head>{head}</head><body>' + "\n".join(parts) + "</body></html>\n"
-    )
+    write_page(path, f"{about.name} on {about.scene}", parts)
 
 
 def _summary(report: Report) -> list[tuple[str, str]]:
@@ -138,12 +127,7 @@ def _program(report: Report) -> list[tuple[str, str]]:
     ]
 
 
-def _facts_table(rows: Iterable[tuple[str, str]]) -> str:
-    lines = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows)
-    return f'<table class="facts">{lines}</table>'
-
-
-def _cameras_table(report: Report) -> str:
+def _cameras_table(report: Report) -> Html:
     heads = ["camera", "focal, px", "missing ticks", "mean rate", "1 %", "99 %"]
     heads += ["dead", "hot", "flickering", "gain", *report.checked.columns, "residual, dB"]
     focal, residual = {camera.id: camera.fx for camera in report.about.cameras}, residuals(report.found)
@@ -153,42 +137,27 @@ def _cameras_table(report: Report) -> str:
         cells += [*(f"{n}" for n in (f.dead, f.hot, f.flickering)), f"{f.gain:.3f}"]
         cells += [column.get(f.camera, "-") for column in report.checked.columns.values()]
         rows.append([*cells, _decibel(residual[f.camera])])
-    return _table(heads, rows)
+    return table(heads, rows)
 
 
-def _held_out(judged: HeldOutScores) -> str:
+def _held_out(judged: HeldOutScores) -> Html:
     """Return the section of the held-out cameras: a row for each, and their mean."""
     heads = ["camera", "images", *(f"{METRICS[m].title}{', dB' if METRICS[m].unit else ''}" for m in SHOWN)]
     found = [(camera, judged.images[camera], values) for camera, values in judged.cameras.items()]
     found.append(("mean", sum(judged.images.values()), judged.mean))
     rows = [[name, f"{n}", *(METRICS[m].format(values[m]) for m in SHOWN)] for name, n, values in found]
     notes = [f"{METRICS[m].title}: {note}" for m, note in judged.notes.items()]
-    return (
-        f"<h2>Held-out cameras</h2>{_table(heads, rows)}"
-        "<p>The fit has not seen these cameras. Their renders are compared with the spikes that they recorded "
+    explained = (
+        "The fit has not seen these cameras. Their renders are compared with the spikes that they recorded "
         "themselves, without any ground truth. The spike PSNR (higher is better) compares counts over 5, 20 and 80 "
         "ticks; the noise of counting is in it, so compare it between models of one recording only. The spike deviance "
-        "(lower is better) is what the recorded intervals lose in likelihood against the recorded rates.</p>"
-        + (_list(notes) if notes else "")
+        "(lower is better) is what the recorded intervals lose in likelihood against the recorded rates."
     )
-
-
-def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    lines = ["".join(f"<th>{escape(head)}</th>" for head in heads)]
-    lines += ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
-    return f'<div class="scroll"><table>{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
-
-
-def _list(notes: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>"
+    return section("Held-out cameras", [table(heads, rows), paragraph(explained), bullets(notes)])
 
 
 def _decibel(value: float) -> str:
     return f"{value:.2f}" if math.isfinite(value) else "-"
-
-
-def _image(png: bytes, text: str) -> str:
-    return f'<img alt="{escape(text)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
 
 
 def poses_plot(cameras: Sequence[Camera], given: Sequence[Camera]) -> bytes:
