@@ -115,7 +115,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     found = environment.find_spec
     monkeypatch.setattr(environment, "find_spec", lambda name: found("numba") if name == "numba_cuda" else found(name))
     monkeypatch.setattr(torch.version, "cuda", "12.8")
-    monkeypatch.setattr(environment, "_version", {"cuda-bindings": "12.9.4"}.get)
+    monkeypatch.setattr(environment, "installed_version", {"cuda-bindings": "12.9.4"}.get)
     monkeypatch.setattr(environment, "trial", lambda device: "")
 
 
@@ -147,7 +147,7 @@ def test_two_versions_of_cuda_in_one_process_are_refused(
     pytorch: str, bindings: str, fix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.version, "cuda", pytorch)
-    monkeypatch.setattr(environment, "_version", {"cuda-bindings": bindings}.get)
+    monkeypatch.setattr(environment, "installed_version", {"cuda-bindings": bindings}.get)
     missing = missing_rasterizer()
     assert missing and missing.fix == fix
     assert missing.expected == f"numba-cuda for CUDA {pytorch[:2]}, which PyTorch is for"
