@@ -15,7 +15,7 @@ def change_text(row: MeasuredRow, other: MeasuredRow) -> str:
     found = changes(row, other)
     same_row = row.name.removesuffix(REFINED) == other.name.removesuffix(REFINED)
     mixed = same_row and {r["code"] for r in row.cells.values()} != {r["code"] for r in other.cells.values()}
-    return "-" if found is None else " / ".join(f"{change:+.2f}" for change in found) + f" {OTHER_CODE}" * mixed
+    return "-" if found is None else " / ".join(f"{change:+.2f}" for change in found) + OTHER_CODE * mixed
 
 
 def legend_of(text: str, lines: Iterable[Sequence[str]]) -> str:

@@ -322,7 +322,7 @@ def test_a_change_between_two_codes_of_a_row_is_marked() -> None:
     assert "| -1.00 / -1.00 |" in line and "†" not in legend
     other = [record(OURS, s, 29.0, code="00000000000c") for s in lens]
     line, legend = (conditions_block([*before, *other])[k] for k in (3, 5))
-    assert "| -1.00 / -1.00 † |" in line and "†: the two were measured with different code" in legend
+    assert "| -1.00 / -1.00† |" in line and "†: the two were measured with different code" in legend
 
 
 def test_a_condition_that_was_made_in_one_world_is_compared_with_that_world():
