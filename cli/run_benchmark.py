@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
@@ -147,11 +147,12 @@ def run_benchmark(
     if choice.track is not None and (scenes or choice.table is not None):
         found = str(scenes[0]) if scenes else f"--table {choice.table}"
         raise problem("--track", "neither scenes nor a table beside it", found, "use --data for the folder")
-    given = _given(choice)
-    for option, needed in _NEEDS.items():
-        if option in given and not any(other in given for other in needed):
+    default = SceneChoice()
+    for name, needed in _NEEDS.items():
+        if getattr(choice, name) != getattr(default, name) and all(getattr(choice, other) is None for other in needed):
+            option = "--from" if name == "source" else f"--{name}"
             expected = f"{' or '.join(f'--{other}' for other in needed)} beside it"
-            raise problem(given[option], expected, "none", f"leave {given[option]} out")
+            raise problem(option, expected, "none", f"leave {option} out")
     paper = None if choice.table is None else published(choice.table, choice.poses)
     if paper:
         if scenes:
@@ -161,13 +162,6 @@ def run_benchmark(
         scenes = track_folders(track_scenes(choice.track), choice.data, choice.source, is_equivalent)
     runs = _run(scenes, _choose_methods(fits, None), (choice.split,), choice.allow_gaps, fits)
     return _finish(runs, scenes, choice.allow_gaps, entries)
-
-
-def _given(group: SceneChoice | FitChoice | EntryChoice) -> dict[str, str]:
-    """Return the fields that differ from their defaults, each with the name of its option."""
-    options = {"settings": "--set", "source": "--from"}
-    names = [f.name for f in fields(group) if getattr(group, f.name) != f.default]
-    return {name: options.get(name, f"--{name.replace('_', '-')}") for name in names}
 
 
 def _run_table(paper: PublishedTable, choice: SceneChoice, fits: FitChoice, entries: EntryChoice) -> int:

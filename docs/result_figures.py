@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,12 @@ MEASURED = {"psnr": "PSNR, dB", RANKED_BY: "PSNR where things move, dB"}
 SHOWN_CONDITIONS = ("light 1/16", "four times as fast", "5 of 8 cameras")
 SHEET_WIDTH = 1500  # pixels
 QUICK = make_budget("quick").label
+
+
+@cache
+def measured() -> list[Record]:
+    """Return all records."""
+    return list(read_records(RECORDS).values())
 
 
 def images(strip: Path, out: Path) -> None:
@@ -112,7 +119,7 @@ def uncalibrated(out: Path) -> None:
 def modality(out: Path) -> None:
     """Show PSNR where things move against bits per second, from the records."""
     png = out.with_suffix(".png")
-    plot_modality(png, list(read_records(RECORDS).values()))
+    plot_modality(png, measured())
     _as_webp(png, out)
 
 
@@ -121,7 +128,7 @@ def conditions(out: Path) -> None:
 
     The change that a condition makes in one world alone is added to the mean of both.
     """
-    records = list(read_records(RECORDS).values())
+    records = measured()
     figure = new_figure((13, 8), "constrained")
     panels = figure.subplots(len(MEASURED), len(LEVELS), sharex="col", sharey="row")
     for line, (metric, title) in zip(panels, MEASURED.items(), strict=True):
@@ -200,7 +207,7 @@ def covisible(every: Path, three: Path, out: Path) -> None:
 
 
 def _moving(group: Group) -> dict[str, float]:
-    own = of_group(group, list(read_records(RECORDS).values()))
+    own = of_group(group, measured())
     rows = rows_of([row.name for row in group.rows], group.scenes, own)
     return {row.name: value for row in rows if (value := row.mean(RANKED_BY)) is not None}
 
@@ -217,7 +224,7 @@ def sheets(sweep: Path, scenes: Path, out: Path) -> None:
 
 def _predictions(sweep: Path, row: str, scene: str, split: str = DEFAULT_SPLIT) -> Path | None:
     """Return the predictions of a row's record with seed 0, which are in the folder of the code that made it."""
-    for r in read_records(RECORDS).values():
+    for r in measured():
         if (r["row"], r["scene"], r["split"], r["budget"], r["seed"]) == (row, scene, split, QUICK, 0):
             folder = sweep / r["code"] / f"quick-{split}" / "seed-0" / "predictions" / row / scene
             return folder if folder.is_dir() else None

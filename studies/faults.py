@@ -20,7 +20,7 @@ from spike4dgs.benchmark.environment import command_line, device_type, environme
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, write_json, write_text
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, choose_device_for, get_method, make_budget
-from spike4dgs.benchmark.metrics.measure import score_image
+from spike4dgs.benchmark.metrics.measure import mean, score_image
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
@@ -185,8 +185,7 @@ def _scores(folder: Path, truth: Scene) -> dict[str, float | None]:
     images = [
         score_image(truth.ground_truth(t), predictions.read(t), truth.moving(t), metrics=METRICS) for t in truth.targets
     ]
-    values = {m: [image[m] for image in images if m in image] for m in METRICS}
-    return {m: sum(v) / len(v) if v else None for m, v in values.items()}
+    return {m: mean(image[m] for image in images if m in image) for m in METRICS}
 
 
 def _write(out: Path, found: Sequence[Outcome], about: Mapping[str, Any]) -> None:

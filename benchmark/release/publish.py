@@ -180,7 +180,8 @@ def _to_zenodo(root: Path, upload: Upload, token: str, progress: ByteProgress) -
         raise problem(api, f"a bucket at {upload.address}", bucket, "look at Zenodo's status page")
     draft = _json(_ask("PUT", address, token, body=body)[0], address)
     there = {str(f.get("filename")): str(f.get("checksum")).removeprefix("md5:") for f in draft.get("files", [])}
-    for stale in (f for f in draft.get("files", []) if f.get("filename") not in {file.name for file in upload.files}):
+    names = {file.name for file in upload.files}
+    for stale in (f for f in draft.get("files", []) if f.get("filename") not in names):
         _ask("DELETE", f"{address}/files/{quote(str(stale.get('id')), safe='')}", token)
     for file in upload.files:
         md5 = _md5(root / file.name)

@@ -16,7 +16,7 @@ from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import MAIN, METRICS
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record
-from spike4dgs.benchmark.runs.refinement import SUFFIX
+from spike4dgs.benchmark.runs.refinement import is_refined
 
 SHORT = (*MAIN, "fit_seconds", "render_fps")  # columns by default
 WIDE = 240  # characters that hold every column
@@ -141,12 +141,8 @@ def blocks_of(
     return metrics, costs, blocks
 
 
-def _has_rank(row: _Row) -> bool:
-    return not row.name.endswith(SUFFIX)  # a method has one: without refined held-out poses
-
-
 def _block(title: str, metrics: Sequence[Metric], costs: Sequence[str], rows: Sequence[_Row]) -> Block:
-    best, ranked = dict[str, float](), [row for row in rows if _has_rank(row)]
+    best, ranked = dict[str, float](), [row for row in rows if not is_refined(row.name)]
     for m in metrics:
         known = [v for row in ranked if (v := row.mean(m.id)) is not None]
         if known and len(ranked) > 1:
@@ -154,7 +150,7 @@ def _block(title: str, metrics: Sequence[Metric], costs: Sequence[str], rows: Se
     made = []
     for row in rows:
         failed = sorted({cell["status"] for cell in row.cells} - {"ok"})
-        values = [(row.text(m), _has_rank(row) and row.mean(m.id) == best.get(m.id, "")) for m in metrics]
+        values = [(row.text(m), not is_refined(row.name) and row.mean(m.id) == best.get(m.id, "")) for m in metrics]
         shown = [(row.cost(key, COSTS[key][1]), False) for key in costs]
         made.append((row.name + (f" ({', '.join(failed)})" if failed else ""), [*values, *shown]))
     return Block(title, made)

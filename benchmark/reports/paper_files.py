@@ -15,7 +15,7 @@ from spike4dgs.benchmark.reports.console import blocks_of
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, build_table, truth_scores
 from spike4dgs.benchmark.reports.scatter import write_views
 from spike4dgs.benchmark.runs.record import COSTS, Record, dataset_means
-from spike4dgs.benchmark.runs.refinement import SUFFIX
+from spike4dgs.benchmark.runs.refinement import is_refined
 from spike4dgs.benchmark.scene.scene import Scene
 
 Table = Mapping[str, Any]  # from `paper_tables.build_table`
@@ -129,7 +129,7 @@ def _metric_blocks(table: Table, mark: Mark) -> list[tuple[str, list[str], list[
 
 def _marked(table: Table, values: Sequence[float | None], metric: str, mark: Mark) -> list[str]:
     """Return the rows' values with marks of the best two; a row of refined held-out poses has no mark, as no rank."""
-    m, ranked = METRICS[metric], [not r["method"].endswith(SUFFIX) for r in table["rows"]]
+    m, ranked = METRICS[metric], [not is_refined(r["method"]) for r in table["rows"]]
     pairs = list(zip(values, ranked, strict=True))
     best = sorted({v for v, counts in pairs if counts and v is not None}, reverse=m.higher_is_better)[:2]
     return [

@@ -21,7 +21,7 @@ from spike4dgs.benchmark.metrics.metric import Metric
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import COSTS, Record
-from spike4dgs.benchmark.runs.refinement import SUFFIX
+from spike4dgs.benchmark.runs.refinement import is_refined
 from spike4dgs.benchmark.scene.scene import Scene
 
 SCHEMA = "spike4dgs-table/1"
@@ -139,8 +139,7 @@ def build_table(
     """
     rows = [_row(table, record, worlds) for record in records]
     for metric in table_columns(table):
-        # A method has one rank: that of its own record, not of the one with refined held-out poses.
-        measured = [None if r["method"].endswith(SUFFIX) else r["mean"][metric]["value"] for r in rows]
+        measured = [None if is_refined(r["method"]) else r["mean"][metric]["value"] for r in rows]
         printed = [r["mean"][metric]["published"] for r in rows]
         both = [p if v is not None else None for v, p in zip(measured, printed, strict=True)]
         ours, theirs = ranks(measured, METRICS[metric]), ranks(both, METRICS[metric])

@@ -23,6 +23,11 @@ SUFFIX = ".refined"
 MAX_MS = 10.0  # of the image
 
 
+def is_refined(name: str) -> bool:
+    """Return whether a record's name is of refined scores, which have no rank: a method has one, without them."""
+    return name.endswith(SUFFIX)
+
+
 class Refinable(Protocol):
     """A model that can estimate the pose of an image."""
 

@@ -23,6 +23,7 @@ from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
+from spike4dgs.benchmark.runs.refinement import is_refined
 from spike4dgs.benchmark.runs.run import JobFiles, Settings, check_inputs, run_cells
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.reading import typical_fit_seconds
@@ -206,7 +207,7 @@ def _measure(todo: Sequence[Cell], methods: Mapping[str, Method], kept: _Kept, s
                 cell.seed,
                 DEVICE,
                 make_budget(cell.budget),
-                refined=cell.row.endswith(REFINED),
+                refined=is_refined(cell.row),
             ),
             settings.out / kept.codes[cell.row] / f"{cell.budget}-{cell.split}" / f"seed-{cell.seed}",
             settings.quiet,  # its times are of one whole fit

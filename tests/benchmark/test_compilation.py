@@ -92,6 +92,15 @@ def plus(x):
 """
 
 
+@pytest.fixture
+def kernel_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to import kernel_of_parts.py from, with a cache of machine code in it."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    (tmp_path / "kernel_of_parts.py").write_text(KERNEL)
+    return tmp_path
+
+
 def changed_parts(folder: Path, texts: list[str]) -> tuple[list[int], list[int]]:
     """Return kernel(10) of kernel_of_parts.py with each text of parts_of_kernel.py, and the machine codes kept then."""
     found, counts = [], []
@@ -106,15 +115,10 @@ def changed_parts(folder: Path, texts: list[str]) -> tuple[list[int], list[int]]
     return found, counts
 
 
-def test_a_kernel_is_compiled_anew_where_another_file_changes_what_is_in_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kernel_is_compiled_anew_where_another_file_changes_what_is_in_it(kernel_folder: Path) -> None:
     """numba itself looks at the kernel's file alone, and would go on with the machine code of the first."""
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    (tmp_path / "kernel_of_parts.py").write_text(KERNEL)
     texts = [PARTS, PARTS.replace("SCALE = 2", "SCALE = 7"), PARTS.replace("_ADDED = 1", "_ADDED = 30"), PARTS]
-    found, counts = changed_parts(tmp_path, texts)
+    found, counts = changed_parts(kernel_folder, texts)
     assert found == [21, 71, 50, 21] and counts == [1, 2, 3, 3], "the last is the first one's"
 
 
@@ -136,13 +140,8 @@ def plus(typing, x):
 """
 
 
-def test_a_kernel_is_compiled_anew_where_an_intrinsic_writes_other_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    (tmp_path / "kernel_of_parts.py").write_text(KERNEL)
-    found, counts = changed_parts(tmp_path, [INTRINSIC, INTRINSIC.replace("type(1)", "type(5)"), INTRINSIC])
+def test_a_kernel_is_compiled_anew_where_an_intrinsic_writes_other_code(kernel_folder: Path) -> None:
+    found, counts = changed_parts(kernel_folder, [INTRINSIC, INTRINSIC.replace("type(1)", "type(5)"), INTRINSIC])
     assert found == [21, 25, 21] and counts == [1, 2, 2]
 
 
