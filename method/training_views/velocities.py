@@ -73,7 +73,7 @@ def _triangulated(points: Tensor, views: Views, flows: Tensor) -> Tensor:
     J, uv = _jacobians(points, views)
     size = uv.new_tensor([views.width, views.height])
     grid = (2 * uv / size - 1)[:, None]
-    seen = grid_sample(flows, grid, padding_mode="zeros", align_corners=False)[:, :, 0].mT  # [C, N, 2]
+    seen = grid_sample(flows, grid, padding_mode="border", align_corners=False)[:, :, 0].mT  # [C, N, 2]
     known = ((uv >= 0) & (uv < size) & seen.isfinite()).all(-1)
     seen = torch.where(known[..., None], seen, 0.0)
     J = torch.where(known[..., None, None], J, 0.0)

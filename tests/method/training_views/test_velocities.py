@@ -13,7 +13,7 @@ from spike4dgs.method.splat import Views
 from spike4dgs.method.splat.lens import bent, lens_rays
 from spike4dgs.method.training_views import velocities
 from spike4dgs.method.training_views.training_images import TrainingImages
-from spike4dgs.method.training_views.velocities import LEAST_VIEWS, _jacobians, velocities_at
+from spike4dgs.method.training_views.velocities import LEAST_VIEWS, _jacobians, _triangulated, velocities_at
 
 TICKS = tuple(range(50, 400, 50))
 VELOCITY = torch.tensor([0.0012, -0.0008, 0.0020], dtype=torch.float64)  # m a tick: two pixels in 50
@@ -72,6 +72,17 @@ def test_points_that_too_few_views_see_rest() -> None:
     found = velocities_at(aside, images_of(views(LEAST_VIEWS)), 50)
     assert found[0].norm() > 0 and not found[1:].any()
     assert not velocities_at(aside, images_of(views(LEAST_VIEWS - 1)), 50).any()
+
+
+@pytest.mark.usefixtures("no_prior")
+def test_a_flow_counts_whole_in_the_outer_half_pixel() -> None:
+    v = views(5)
+    K = v.K.double()
+    K[:, :2, 2] += 0.2 - _jacobians(POINTS[:1], v)[1][:, 0]  # the point is 0.2 px from the corner of each view
+    v = replace(v, K=K)
+    flow = _jacobians(POINTS[:1], v)[0][:, 0] @ VELOCITY
+    found = _triangulated(POINTS[:1], v, flow[..., None, None].expand(-1, -1, v.height, v.width))
+    assert (found - VELOCITY).norm() < 0.01 * VELOCITY.norm()
 
 
 def test_images_that_do_not_reach_far_enough_tell_nothing() -> None:
