@@ -21,7 +21,7 @@ from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.manifest import Manifest
 from spike4dgs.benchmark.screen.shown import Shown
-from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_total, open_counted
+from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_total, open_counted, total_counts
 from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import open_stream
 
@@ -96,7 +96,7 @@ class Calibration(Shown):
 
 
 def estimate(recordings: Recordings) -> Calibration:
-    """Return the gain and dark maps of a camera.
+    """Return the gain and dark maps of a camera. A pixel that never fires under uniform light is dead: its gain is 0.
 
     Raises UserError where the recordings do not fit together, or where no pixel responds to the light.
     """
@@ -105,7 +105,7 @@ def estimate(recordings: Recordings) -> Calibration:
         found = f"{flat.width}x{flat.height}, {dark.width}x{dark.height} and radiance {recordings.flat_radiance:g}"
         raise problem("calibration", "two recordings of one size and a positive radiance", found, "correct them")
     dark_rate = rates(dark)
-    light = np.maximum(rates(flat) - dark_rate, 0)
+    light = np.where(total_counts(flat) > 0, np.maximum(rates(flat) - dark_rate, 0), 0)
     if not (mean := float(light.mean())) > 0:
         raise problem("flat-field recording", "light", "no more spikes than in the dark", "record it again")
     return Calibration((light / mean).astype(np.float32), dark_rate.astype(np.float32), mean / recordings.flat_radiance)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import array_cameras, write_small_scene
 
+from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.scene.calibration import Recordings, estimate, rates
@@ -84,6 +85,21 @@ def test_recordings_that_do_not_fit_are_refused():
         estimate(Recordings(other, dark, 0.7))
     with pytest.raises(UserError, match="no more spikes than in the dark"):
         estimate(Recordings(dark, dark, 0.7))
+
+
+def test_a_dead_pixel_has_no_gain_and_shows_as_nan():
+    charge = np.random.default_rng(0).random((8, 16))
+    light, dark = (
+        np.diff(np.floor(np.arange(ticks + 1)[:, None, None] * rate + charge), axis=0)
+        for ticks, rate in ((500, 0.42), (2000, 0.005))
+    )
+    light[:, 3, 4] = dark[:, 3, 4] = 0
+    flat, black = (SpikeStream(pack(spikes), 16, 8, 2e4) for spikes in (light, dark))
+    found = estimate(Recordings(flat, black, 0.7))
+    assert np.argwhere(found.gain <= 0).tolist() == [[3, 4]] and ", 1 dead," in repr(found)
+    assert found.gain.mean() == pytest.approx(1)
+    image = IMAGES["tfp"](flat, [250], 0.6, found)[0]
+    assert np.argwhere(np.isnan(image)).tolist() == [[3, 4]]
 
 
 def scene_with_recordings(root, facts):
