@@ -7,6 +7,7 @@ pixel's rate changes under steady light: its counts in windows of WINDOW_TICKS d
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,19 +48,26 @@ class BadPixels:
 
 
 def find_bad(stream: SpikeStream, flat: Recording | None = None, dark: Recording | None = None) -> BadPixels:
-    """Return the bad pixels of a camera: from its recordings, or without them by isolation in `stream`."""
+    """Return the bad pixels of a camera: from its recordings, or without them by isolation in `stream`.
+
+    The zeros within gaps count nowhere: they would hide a hot pixel as one that flickers.
+    """
     if flat and dark:
         return from_recordings(flat, dark)
     seen = max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
-    return isolated(total_counts(stream) / seen, seen, deviation(stream))
+    held = present(set(stream.gaps) - set(stream.filled), stream.n_ticks)
+    return isolated(total_counts(stream) / seen, seen, deviation(stream, held))
 
 
-def deviation(stream: Recording) -> Float64:
+def deviation(stream: Recording, held: Mask | None = None) -> Float64:
     """Return the standard deviation of each pixel's counts in windows of WINDOW_TICKS [H, W].
 
-    What the whole chip does, as under a lamp that flickers, does not count. Zero for fewer than two windows.
+    What the whole chip does, as under a lamp that flickers, does not count, nor do windows with a tick that is not
+    `held` [n_ticks]. Zero for fewer than two windows.
     """
-    starts = range(0, stream.n_ticks - WINDOW_TICKS + 1, WINDOW_TICKS)
+    starts: Sequence[int] = range(0, stream.n_ticks - WINDOW_TICKS + 1, WINDOW_TICKS)
+    if held is not None:
+        starts = [start for start in starts if held[start : start + WINDOW_TICKS].all()]
     total = np.zeros((stream.height, stream.width))
     square = total.copy()
     for start in starts:
