@@ -205,7 +205,7 @@ def _go_on(packed: UInt8, pixel: int, start: int, stop: int, step: int, limit: i
         return
     length = span / n
     place = first + step * _shift(total, n, length)
-    silence = start - place if step > 0 else place - stop
+    silence = start - place if step > 0 else place - (stop - 1)
     if silence >= 2 * length - TIE:
         length = silence
     tick = int(np.floor(place + step * length + 0.5 + TIE))
@@ -249,7 +249,7 @@ def _shift(total: int, n: int, length: float) -> float:
 def fill_pixels(stream: AnyRecording, bad: Mask | None) -> AnyRecording:
     """Return the stream, in memory, whose pixels of a mask [H, W] fire as their nearest pixel outside of it does.
 
-    Of a counted recording the counts are those of that pixel.
+    They are as certain as that pixel is. Of a counted recording the counts are those of that pixel.
     """
     if bad is None or not bad.any() or bad.all():
         return stream
@@ -258,12 +258,13 @@ def fill_pixels(stream: AnyRecording, bad: Mask | None) -> AnyRecording:
     rows, columns = distance_transform_edt(bad, return_distances=False, return_indices=True)
     if isinstance(stream, CountedRecording):
         return stream.taken(rows, columns)
-    packed = np.array(stream.packed)
+    packed, certain = np.array(stream.packed), None if stream.certain is None else np.array(stream.certain)
     for y, x in np.argwhere(bad):
         target, source = _stored(stream, y, x), _stored(stream, rows[y, x], columns[y, x])
-        spikes = packed[:, source >> 3] >> (source & 7) & 1
-        packed[:, target >> 3] = packed[:, target >> 3] & ~np.uint8(1 << (target & 7)) | spikes << (target & 7)
-    return replace(stream, packed=packed)
+        for bits in (packed,) if certain is None else (packed, certain):
+            own = bits[:, source >> 3] >> (source & 7) & 1
+            bits[:, target >> 3] = bits[:, target >> 3] & ~np.uint8(1 << (target & 7)) | own << (target & 7)
+    return replace(stream, packed=packed, certain=certain)
 
 
 def _stored(stream: SpikeStream, y: int, x: int) -> int:

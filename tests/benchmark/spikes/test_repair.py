@@ -87,6 +87,14 @@ def test_gaps_at_the_ends_take_the_rate_beside_them(gap):
     assert np.abs(_counts(filled) - known).max() <= 1 + 2 * 30 / NEAR_TICKS
 
 
+def test_a_gap_at_the_start_is_filled_as_one_at_the_end_of_the_reversed_stream():
+    spikes = np.zeros((32, HEIGHT, WIDTH), np.uint8)
+    spikes[:11] = 1
+    ends, begins = (fill_gaps(stream_of(s, [gap])) for s, gap in ((spikes, (12, 20)), (spikes[::-1], (0, 20))))
+    assert ends.window(12, 32)[:, 0, 0].tolist() == [1, 0] * 10, "the silent tick before the gap tells the interval"
+    np.testing.assert_array_equal(begins.window(0, 32), ends.window(0, 32)[::-1])
+
+
 def even_train(times, lost):
     """Return the times that even spikes explain, away from the gap, and the bounds of their interval."""
     even = EVEN if lost <= LONGEST_TICKS else FAR_EVEN
@@ -151,7 +159,7 @@ def go_on(times, start, stop):
         return []
     step = (times[0] - times[-1]) / (len(times) - 1)  # with its sign
     at = place(times, abs(step))
-    silence = start - at if step > 0 else at - stop
+    silence = start - at if step > 0 else at - (stop - 1)
     if silence >= 2 * abs(step) - TIE:
         step = math.copysign(silence, step)
     return [t for t in (math.floor(at + k * step + 0.5 + TIE) for k in range(1, TICKS)) if start <= t < stop]
@@ -252,6 +260,17 @@ def test_a_bad_pixel_fires_as_its_neighbour(bottom_up):
     for y, x in np.argwhere(bad):
         near = [(a, b) for a in range(y - 1, y + 2) for b in range(x - 1, x + 2) if 0 <= a < HEIGHT and 0 <= b < WIDTH]
         assert any((found[:, y, x] == spikes[:, a, b]).all() for a, b in near if not bad[a, b])
+
+
+def test_a_bad_pixel_is_as_certain_as_its_neighbour():
+    spikes, bad = steady(RATES), np.zeros((HEIGHT, WIDTH), bool)
+    bad[2, 3] = True
+    spikes[:, 2, 3] = 0  # of which nothing is certain
+    filled = fill_gaps(stream_of(spikes, [(t, 1) for t in range(7, TICKS - 2, 23)]))
+    certain = SpikeStream(fill_pixels(filled, bad).certain, WIDTH, HEIGHT, 2e4)
+    sure = certain.window(0, certain.n_ticks)
+    near = [sure[:, y, x].tolist() for y, x in ((1, 3), (3, 3), (2, 2), (2, 4))]
+    assert sure[:, 2, 3].any() and sure[:, 2, 3].tolist() in near
 
 
 def test_gaps_of_a_mapped_file_are_filled_next_to_it(tmp_path):
