@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.lens import NAMES, Distortion, make_distortion
+from spike4dgs.benchmark.spikes.sensor_model import MOST_DEAD_TICKS
 
 # Literature has doublings every 5 to 8 K near room temperature (A. Theuwissen, harvestimaging.com, September 2009).
 # Silicon's band gap gives 4.5 K where dark current comes by diffusion and 9.0 K where it is generated in depletion.
@@ -238,7 +239,7 @@ _RANGES: dict[str, tuple[str, float, float]] = {  # what it is, from, to
     "warming_k": ("kelvin from -50 to 50", -50, 50),
     "reset_noise": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
     "read_noise": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
-    "dead_ticks": ("ticks from 0 to 100", 0, 100),
+    "dead_ticks": (f"ticks from 0 to {MOST_DEAD_TICKS}", 0, MOST_DEAD_TICKS),
     "clock_ripple": (f"thresholds from 0 to {_MOST_NOISE}", 0, _MOST_NOISE),
     "light": ("a share from 1/1024 to 16", 1 / 1024, 16),
     "lost_ticks": ("a share from 0 to 0.5", 0, 0.5),

@@ -99,6 +99,7 @@ class SceneEntry:
     rows_bottom_up: bool
     streams: dict[str, str]  # camera -> path
     gaps: tuple[dict[str, Any], ...]
+    dead_ticks: float = 0.0
 
     @property
     def bytes(self) -> int:
@@ -130,9 +131,14 @@ def release_json(name: str, scenes: list[SceneEntry], shards: list[Shard]) -> di
         "schema": SCHEMA,
         "name": name,
         "block_bytes": BLOCK,
-        "scenes": [{**asdict(scene), "bytes": scene.bytes} for scene in scenes],
+        "scenes": list(map(_facts, scenes)),
         "shards": list(map(asdict, shards)),
     }
+
+
+def _facts(scene: SceneEntry) -> dict[str, Any]:
+    facts = {**asdict(scene), "bytes": scene.bytes}
+    return {name: value for name, value in facts.items() if name != "dead_ticks" or value}
 
 
 def parse_release(text: bytes, sha256: str, where: str) -> Release:

@@ -186,6 +186,7 @@ def _entry(scene: Scene, samples: tuple[Sample, ...]) -> SceneEntry:
         rows_bottom_up=bool(scene.meta["sensor"]["rows_bottom_up"]),
         streams=dict(scene.meta["streams"]),
         gaps=tuple(gap.record for gap in scene.gaps),
+        dead_ticks=float(scene.meta["sensor"].get("dead_ticks", 0)),
     )
 
 

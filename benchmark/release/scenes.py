@@ -168,8 +168,9 @@ class _Download:
         streams = {}
         for path in visible(root, "*.dat"):
             size, order, gaps = (scene.width, scene.height), scene.rows_bottom_up, _gaps_in(scene, path.stem, ticks)
+            n_ticks, dead = len(ticks), scene.dead_ticks
             streams[path.stem] = open_stream(
-                path, *size, scene.rate_hz, rows_bottom_up=order, n_ticks=len(ticks), gaps=gaps
+                path, *size, scene.rate_hz, rows_bottom_up=order, n_ticks=n_ticks, gaps=gaps, dead_ticks=dead
             )
         folder.write_stream_folder(root, streams, {"excerpt": excerpt})
         started.unlink(missing_ok=True)

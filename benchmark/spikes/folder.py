@@ -12,8 +12,9 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.spikes.gaps import read_gaps, refuse_gaps
+from spike4dgs.benchmark.spikes.sensor_model import MOST_DEAD_TICKS
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
-from spike4dgs.benchmark.untrusted import MAX_HZ, MAX_SIDE, MAX_TICKS, check_ids, inside, positive, whole
+from spike4dgs.benchmark.untrusted import MAX_HZ, MAX_SIDE, MAX_TICKS, check_ids, inside, number, positive, whole
 
 NAME = "stream.json"
 _SCHEMA = "spike4dgs-streams/1"
@@ -32,6 +33,7 @@ def write_stream_folder(root: Path, streams: Mapping[str, SpikeStream], facts: M
             "rate_hz": s.rate_hz,
             "rows_bottom_up": s.rows_bottom_up,
             "n_ticks": s.n_ticks,
+            **({"dead_ticks": s.dead_ticks} if s.dead_ticks else {}),
         }
         for camera, s in streams.items()
     }
@@ -59,8 +61,9 @@ def open_stream_folder(root: Path, allow_gaps: bool = False) -> dict[str, SpikeS
             width, height = (whole(s[key], 1, MAX_SIDE) for key in ("width", "height"))
             own, order = tuple(gap for gap in gaps if gap.camera == camera), bool(s["rows_bottom_up"])
             file, rate_hz = inside(root, str(s["file"]), path), positive(s["rate_hz"], MAX_HZ)
+            dead = number(s.get("dead_ticks", 0), 0, MOST_DEAD_TICKS)
             streams[camera] = open_stream(
-                file, width, height, rate_hz, rows_bottom_up=order, n_ticks=ticks[camera], gaps=own
+                file, width, height, rate_hz, rows_bottom_up=order, n_ticks=ticks[camera], gaps=own, dead_ticks=dead
             )
     except (KeyError, TypeError, ValueError, AttributeError) as e:
         raise problem(path, "file, width, height, rate_hz, ... of streams", repr(e), "import it again") from None

@@ -52,13 +52,14 @@ SENSOR = SensorModel()
 
 
 LEAST_LIVE = 1 / 16  # of the time: a pixel that fires in every tick has seen at most 16 thresholds a tick
+MOST_DEAD_TICKS = 10  # of a camera: up to 2.5 times white, `gathered` then finds the charge that `fired` was given
 
 
 def gathered(rate: Any, dead_ticks: float) -> Any:
     """Return the charge per tick behind rates in spikes per tick: `rate` itself where no tick is dead.
 
     A pixel that collects no light for N ticks after each spike fires at r = x / (1 + N x) in light that gives it the
-    charge x a tick. So x = r / (1 - N r): light is proportional to 1 / (interval - N).
+    charge x a tick. So x = r / (1 - N r): light is proportional to 1 / (interval - N), as far as N x is at most 15.
 
     >>> gathered(np.array([0.0, 1 / 3]), 1.0).round(6)
     array([0. , 0.5])
@@ -67,7 +68,7 @@ def gathered(rate: Any, dead_ticks: float) -> Any:
 
 
 def fired(charge: Any, dead_ticks: float) -> Any:
-    """Return the spikes per tick of pixels that gather `charge` a tick: the inverse of `gathered`."""
+    """Return the spikes per tick of pixels that gather `charge` a tick: the inverse of `gathered`, up to its bound."""
     return charge / (1 + dead_ticks * charge) if dead_ticks else charge
 
 

@@ -78,9 +78,9 @@ def _source(profile: RigProfile, record: ClipRecord) -> dict[str, Any]:
 
 
 def _finish_streams(out: Path, profile: RigProfile, record: ClipRecord) -> None:
-    size, gaps = (profile.width, profile.height), merged(record.gaps, record.n_ticks)
+    size, gaps, dead = (profile.width, profile.height), merged(record.gaps, record.n_ticks), profile.dead_ticks
     streams = {
-        c.id: open_stream(out / f"{c.id}.dat", *size, float(profile.fps), gaps=gaps_of(c.id, gaps))
+        c.id: open_stream(out / f"{c.id}.dat", *size, float(profile.fps), gaps=gaps_of(c.id, gaps), dead_ticks=dead)
         for c in profile.cameras
     }
     facts = {"clock": _clock(record), "sync": _sync(record), "source": _source(profile, record)}

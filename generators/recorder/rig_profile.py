@@ -17,6 +17,7 @@ from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.cameras import Camera, check_lens, check_rotation
 from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
+from spike4dgs.benchmark.spikes.sensor_model import MOST_DEAD_TICKS
 from spike4dgs.benchmark.untrusted import MAX_SIDE, Expected, read_npz, shown
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.toml_table import (
@@ -61,7 +62,11 @@ _RIG: dict[str, Kind[Any]] = {
     "licence": TEXT,
     "sensor": TEXT,
     "radiance_gain": number(0, 1, "a number above 0, 1 at most"),
-    "dead_ticks": values("a number from 0 to 100", lambda v: type(v) in (int, float) and 0 <= v <= 100, float),
+    "dead_ticks": values(
+        f"a number from 0 to {MOST_DEAD_TICKS}",
+        lambda v: type(v) in (int, float) and 0 <= v <= MOST_DEAD_TICKS,
+        float,
+    ),
     "held_out": tuple_of(_ID, "a list of cameras"),
 }
 _TRANSFER: dict[str, Kind[Any]] = {

@@ -75,6 +75,7 @@ def test_an_option_replaces_that_of_the_named_camera():
         ({"flicker_hz": 0.0}, "--flicker-hz"),
         ({"pose_noise_deg": -1.0}, "--pose-noise-deg"),
         ({"dead_ticks": -1}, "--dead-ticks"),
+        ({"dead_ticks": 11}, "--dead-ticks: expected ticks from 0 to 10"),
         ({"read_noise": 1.0}, "--read-noise"),
         ({"light": 0.0}, "--light: expected a share from 1/1024 to 16"),
         ({"lost_ticks": 1.0}, "--lost-ticks"),

@@ -31,6 +31,7 @@ from spike4dgs.benchmark.release.scenes import Report, download, open_release
 from spike4dgs.benchmark.release.selection import Selection
 from spike4dgs.benchmark.release.source import Patience, Source
 from spike4dgs.benchmark.scene.images import write_exr
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene, open_scenes
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.cli import main
@@ -77,6 +78,15 @@ def test_a_release_whose_truth_was_exchanged_is_refused(tmp_path: Path) -> None:
     pack(open_scenes([root]), tmp_path / "release", "1", 6_000_000)
     with pytest.raises(UserError, match=r"images/cam_03/000040\.exr: expected content .* the manifest claims another"):
         fetch(str(tmp_path / "release"), tmp_path / "out")
+
+
+def test_a_window_has_the_scenes_dead_ticks(tmp_path: Path) -> None:
+    root = write_small_scene(tmp_path / "pattern-1")
+    edit_json(root / "scene.json", lambda meta: meta["sensor"].update(dead_ticks=0.5))
+    write_manifest(root)
+    pack(open_scenes([root]), tmp_path / "release", "1", 6_000_000)
+    report = fetch(str(tmp_path / "release"), tmp_path / "out", Selection(cameras=("cam_01",), window_ms=(1.0, 3.0)))
+    assert open_stream_folder(report.folders[0])["cam_01"].dead_ticks == 0.5
 
 
 @pytest.mark.parametrize("scheme", ["path", "file", "memory"])

@@ -193,13 +193,14 @@ def test_gaps_hold_zeros_and_every_reader_asks_to_allow_them(
 
 
 def test_a_rig_without_poses_records_a_folder_of_streams(tmp_path: Path) -> None:
-    profile = rig(calibrated=False)
+    profile = rig(calibrated=False, dead_ticks=1.0)
     packed = streams(profile)
     root = write_clip(tmp_path / "a clip", profile, packed, ClipRecord(TICKS, GAPS, SYNC))
     with pytest.raises(UserError, match=r"stream\.json: expected a recording without gaps"):
         open_stream_folder(root)
     found = open_stream_folder(root, allow_gaps=True)
     assert {name: s.gaps for name, s in found.items()} == {"cam_00": GAPS[:2], "cam_01": (), "cam_02": GAPS[2:]}
+    assert {s.dead_ticks for s in found.values()} == {1.0}
     assert (root / "cam_01.dat").read_bytes() == packed["cam_01"].tobytes()
     facts = json.loads((root / "stream.json").read_text())
     assert facts["source"]["kind"] == "recorder" and facts["sync"]["method"] == "frame tags"

@@ -117,6 +117,7 @@ def cut(old: str, new: str = "") -> Callable[[str], str]:
         (cut('height = 24\nlayout = "plain"', 'height = 3\nlayout = "tagged-rows"'), "layout", "4 rows or more"),
         (cut("[transfer]", "speed = 3\n[transfer]"), "speed", "expected keys among"),
         (cut("[transfer]", "radiance_gain = nan\n[transfer]"), "radiance_gain", "above 0, 1 at most, found nan"),
+        (cut("[transfer]", "dead_ticks = 11\n[transfer]"), "dead_ticks", "expected a number from 0 to 10, found 11"),
         (cut("[transfer]", 'held_out = ["middle"]\n[transfer]'), "held_out", "found middle"),
         (cut("[transfer]", 'held_out = ["left", "right"]\n[transfer]'), "held_out", "not all"),
         (cut("[transfer]", 'held_out = ["left", "left"]\n[transfer]'), "held_out", "each once"),
