@@ -22,6 +22,7 @@ Shape = tuple[int, int]  # H, W
 _AGAIN = "render or restore it"
 _MOST_CHANNELS = 16  # of an EXR: renderers write colour, depth, ids, flow and normals
 _MOST_SAMPLES = 1 << 27  # pixels times channels: 512 MB as floats
+_BITS_PER_SAMPLE = 258  # number of the tag in a TIFF
 _PNG_ERRORS = (SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error)  # beside OSError
 
 
@@ -213,13 +214,19 @@ def _read_png(path: Path, what: str, shape: Shape | None, modes: tuple[str, ...]
         with Image.open(path, formats=("PNG",)) as image:
             _check_size(path, (image.height, image.width), shape)
             _check_samples(path, image.height * image.width * len(image.getbands()))
-            if modes and image.mode not in modes:
-                raise problem(path, what, f"mode {image.mode}", _AGAIN)
+            if modes and ((deep := is_deep(image)) or image.mode not in modes):
+                raise problem(path, what, f"mode {image.mode}" + (", of more bits" if deep else ""), _AGAIN)
             return np.asarray(image if modes else image.convert("L"))
     except FileNotFoundError:
         raise problem(path, what, "no such file", _AGAIN) from None
     except (OSError, *_PNG_ERRORS, Image.DecompressionBombError, Image.DecompressionBombWarning) as e:
         raise problem(path, what, f"damaged data ({str(e)[:200]})", _AGAIN) from None
+
+
+def is_deep(image: Any) -> bool:
+    """Return whether an opened image has more than 8 bits a channel: Pillow gives 16 of RGB the mode of 8, and cuts."""
+    bits = getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, ())  # of a TIFF; a PNG's are in the format of its data
+    return max(bits, default=8) > 8 or ";16B" in str(image.tile)
 
 
 def write_mask(path: Path, mask: Mask) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from spike4dgs.benchmark.errors import UserError, problem
@@ -147,16 +147,9 @@ def read_manifest(root: Path) -> Manifest:
     except (KeyError, TypeError, ValueError, AttributeError) as e:
         raise problem(path, "path -> {bytes, sha256}", repr(e), "restore it or make the scene again") from None
     for name in files:
-        if not _is_inside(name):
+        if not matches("path", name):
             raise problem(path, "paths inside the scene folder", repr(name), "do not use this scene")
     for name, digest in recorded.items():
         if not matches("sha256", digest):
             raise problem(path, f"64 hex digits as the content of {name}", repr(digest), "restore the file")
     return Manifest(root, files, recorded)
-
-
-def _is_inside(name: str) -> bool:
-    """Return whether a path is plain and relative: no root, no `..`, nothing that another system reads otherwise."""
-    path = PurePosixPath(name)
-    plain = path.as_posix() == name and not set(name) & set("\\\0")
-    return plain and not path.is_absolute() and bool(path.parts) and ".." not in path.parts

@@ -6,12 +6,12 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.scene.images import is_deep
 from spike4dgs.benchmark.untrusted import MAX_SIDE, check_ids
 
 IMAGES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff")
@@ -20,7 +20,6 @@ _FORMATS = ("BMP", "JPEG", "PNG", "TIFF")
 _MODES = {"1": "L", "L": "L", "P": "RGB", "RGB": "RGB", "RGBA": "RGB"}  # of 8 bits a channel -> as it is read
 _MOST_PIXELS = 1 << 26  # of a frame
 _MOST_FRAMES = 1_000_000  # of a video, whose header may state any number
-_BITS_PER_SAMPLE = 258  # number of the tag in a TIFF
 _AGAIN = "restore or export it"
 
 
@@ -102,7 +101,7 @@ def _read(path: Path) -> UInt8:
             if max(image.size) > MAX_SIDE or image.width * image.height > _MOST_PIXELS:
                 found = f"{image.width}x{image.height}"
                 raise problem(path, f"an image of at most {_MOST_PIXELS} pixels", found, "shrink it")
-            deep = _is_deep(image)
+            deep = is_deep(image)
             if deep or image.mode not in _MODES:
                 found = f"mode {image.mode}" + (", of more bits" if deep else "")
                 raise problem(path, "an image of 8 bits a channel", found, "export it with 8 bits")
@@ -111,12 +110,6 @@ def _read(path: Path) -> UInt8:
         raise
     except Exception as e:  # image libraries raise anything
         raise problem(path, "an image", f"damaged data ({str(e)[:200]})", _AGAIN) from None
-
-
-def _is_deep(image: Any) -> bool:
-    """Return whether an opened image has more than 8 bits a channel: Pillow gives 16 of RGB the mode of 8, and cuts."""
-    bits = getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, ())  # of a TIFF; a PNG's are in the format of its data
-    return max(bits, default=8) > 8 or ";16B" in str(image.tile)
 
 
 def _video(path: Path) -> Footage:

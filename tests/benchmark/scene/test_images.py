@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,6 +19,7 @@ from spike4dgs.benchmark.scene.images import (
     gray,
     read_exr,
     read_geometry,
+    read_png,
     read_rgb,
     write_exr,
     write_geometry,
@@ -167,3 +169,9 @@ def test_geometry_that_is_none_is_refused(tmp_path: Path, change: dict[str, np.n
     with pytest.raises(UserError, match=message):
         write_geometry(tmp_path / "a.exr", **{**geometry(4, 5), **change}, t_us=0.0)
     assert not list(tmp_path.iterdir())
+
+
+def test_colours_of_16_bits_are_not_cut_to_8(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "deep.png"), np.full((4, 5, 3), 300, np.uint16))
+    with pytest.raises(UserError, match="expected an 8-bit gray or RGB PNG image, found mode RGB, of more bits"):
+        read_png(tmp_path / "deep.png")

@@ -58,7 +58,9 @@ def test_missing_and_changed_data_are_found_without_the_other_files(full_scene: 
     ]
 
 
-@pytest.mark.parametrize("name", ["../outside", "/etc/passwd", "a/../../b", "a//b", "./a", "a\\..\\b", "..", "", "."])
+@pytest.mark.parametrize(
+    "name", ["../outside", "/etc/passwd", "a/../../b", "a//b", "./a", "a\\..\\b", "..", "", ".", "C:/x"]
+)
 def test_a_path_that_leaves_the_folder_is_refused(full_scene: Path, name: str) -> None:
     edit_manifest(full_scene, lambda files: files.update({name: {"bytes": 1, "sha256": "0" * 64}}))
     with pytest.raises(UserError, match=r"manifest.json: expected paths inside the scene folder"):
