@@ -160,14 +160,9 @@ class EventStream:
             outside = len(column) and not (column.min() >= 0 and column.max() < size[name])
             if column.shape != (len(found.t),) or outside:
                 raise problem(path, f"{name} of every event in [0, {size[name]:g})", "other values", _AGAIN)
-        if (np.diff(found.t) < 0).any():
+        if (found.t[1:] < found.t[:-1]).any():  # a difference of unsigned times would wrap
             raise problem(path, "events in order of time", "an earlier one after a later one", _AGAIN)
         return found
-
-    @property
-    def ticks(self) -> Int64:
-        """The tick that contains each event."""
-        return (self.events.t * (self.rate_hz * 1e-6)).astype(np.int64)
 
     def between(self, start_us: float, stop_us: float) -> Events:
         """Return the events at times start_us <= t < stop_us."""

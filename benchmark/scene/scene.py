@@ -84,7 +84,8 @@ class TrainingScene(Shown):
 
     def tick(self, t_us: float) -> int:
         """Return the tick that contains the time `t_us`, clipped to the clip."""
-        return int(min(max(t_us * self.rate_hz * 1e-6, 0), self.n_ticks - 1))
+        tick = t_us * self.rate_hz / 1e6 + 1e-6  # the time of a tick's start may be rounded down
+        return int(min(max(tick, 0), self.n_ticks - 1))
 
     def _about(self) -> str:
         given = ", ".join(name for name in ("recordings", "found_frames", "found_events") if getattr(self, name))

@@ -16,6 +16,7 @@ from spike4dgs.benchmark.untrusted import check_ids
 
 DEFAULT_SPLIT = "center"
 _FEWEST, _MOST = 3, 8  # training views of the splits views-N
+_AGAIN = "make or import the scene again"
 
 
 class Split(NamedTuple):
@@ -84,8 +85,8 @@ def spread_order(cameras: Sequence[Camera], held_out: str) -> tuple[str, ...]:
 def check_splits(meta: Mapping[str, Any], cameras: Mapping[str, Camera], path: Path) -> None:
     """Raise UserError unless the splits of scene.json name known cameras, and none of them in both parts.
 
-    Held-out cameras may lack a stream: the training part of a hidden scene keeps theirs back. Ids that differ in case
-    alone are refused too.
+    All cameras have the size that scene.json states, and each stream has a pose. Held-out cameras may lack a stream:
+    the training part of a hidden scene keeps theirs back. Ids that differ in case alone are refused too.
     """
     check_ids(meta["splits"], "split", path)
     check_ids(meta["streams"], "camera", path)
@@ -96,7 +97,14 @@ def check_splits(meta: Mapping[str, Any], cameras: Mapping[str, Camera], path: P
         unknown = set(parts["test"]) - set(cameras) | set(parts["train"]) - (set(cameras) & set(meta["streams"]))
         if both or unknown:
             found = f"{', '.join(sorted(both | unknown))} {'in both parts' if both else 'without pose or stream'}"
-            raise problem(path, f"split {split} of known, distinct cameras", found, "make or import the scene again")
+            raise problem(path, f"split {split} of known, distinct cameras", found, _AGAIN)
+    if lost := sorted(set(meta["streams"]) - set(cameras)):
+        raise problem(path, "a pose of every stream", f"{', '.join(lost)} without", _AGAIN)
+    size = meta["width"], meta["height"]
+    for camera in cameras.values():
+        if (camera.width, camera.height) != size:
+            found = f"{camera.id} of {camera.width}x{camera.height}"
+            raise problem(path, f"cameras of {size[0]}x{size[1]} pixels", found, _AGAIN)
 
 
 def read_targets(path: Path, meta: dict[str, Any]) -> dict[str, tuple[Target, ...]]:

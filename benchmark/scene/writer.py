@@ -17,7 +17,7 @@ from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
 from spike4dgs.benchmark.scene.lens import Distortion, make_distortion
 from spike4dgs.benchmark.scene.manifest import Manifest, write_manifest
 from spike4dgs.benchmark.scene.scene import SCHEMA, Target, check_meta
-from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT, Split
+from spike4dgs.benchmark.scene.splits import DEFAULT_SPLIT, Split, check_splits
 
 _POSES = (
     "transforms_*.json: camera to world, OpenGL axes; sparse/0: world to camera, OpenCV axes; pixel centres at +0.5"
@@ -74,7 +74,8 @@ def finish_scene(root: Path, scene: SceneDescription, known: Manifest | None = N
     """Write scene.json, transforms, targets, the COLMAP model, README and croissant.json; last of all the manifest.
 
     The streams, images and everything else are already in `root`; files of another scene that are `known` are not
-    hashed again. A folder without manifest.json is an unfinished scene.
+    hashed again. A folder without manifest.json is an unfinished scene. Raises UserError for facts that no scene has,
+    as cameras of two sizes.
     """
     size, splits = scene.cameras[0], scene.all_splits
     meta = {
@@ -101,6 +102,7 @@ def finish_scene(root: Path, scene: SceneDescription, known: Manifest | None = N
         "source": scene.source,
     }
     check_meta(meta, root / "scene.json")
+    check_splits(meta, {c.id: c for c in scene.cameras}, root / "scene.json")
     write_json(root / "scene.json", meta)
     _write_transforms(root, scene)
     _write_targets(root, scene)
@@ -237,6 +239,7 @@ def _readme(root: Path, scene: SceneDescription) -> str:
         f"  - `{name}`: train {', '.join(s.train)}; test {', '.join(s.test) or 'none'}"
         for name, s in scene.all_splits.items()
     )
+    order = "bottom-up" if scene.sensor["rows_bottom_up"] else "top-down"
     dead = scene.sensor.get("dead_ticks", 0)
     rest = f"\n  A pixel rests for {dead:g} ticks after a spike: a rate r becomes r / (1 + {dead:g} r)." if dead else ""
     return f"""# {scene.title}
@@ -244,7 +247,7 @@ def _readme(root: Path, scene: SceneDescription) -> str:
 Scene `{scene.id}` in the format `{SCHEMA}`. {_summary(scene)}
 Licence: {scene.licence}.
 
-- `spikes/CAMERA.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows bottom-up, ceil(W*H/8) bytes per
+- `spikes/CAMERA.dat`: packed streams, 1 bit per pixel, row-major, LSB first, rows {order}, ceil(W*H/8) bytes per
   tick. Radiance L fires {scene.radiance_gain:g} * L spikes per tick and pixel on average, before gain and dark maps.\
 {rest}
 {contents}

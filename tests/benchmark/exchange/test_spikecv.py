@@ -83,6 +83,7 @@ def test_export_has_no_padding_and_rows_bottom_up(tmp_path: Path) -> None:
     source = write_spikecv(tmp_path / "cam", spikes[:, ::-1])
     import_spikecv(source, tmp_path / "scene", Recording(20000.0, rows_top_down=True), transforms)
     assert (tmp_path / "scene/spikes/cam.dat").read_bytes() == pack(spikes, rows_bottom_up=False).tobytes()
+    assert "rows top-down" in (tmp_path / "scene/README.md").read_text()
     export_spikecv(open_scene(tmp_path / "scene"), tmp_path / "out")
     expected = np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").tobytes()
     assert (tmp_path / "out/cam/cam.dat").read_bytes() == expected

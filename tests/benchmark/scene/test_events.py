@@ -68,8 +68,6 @@ def test_events_are_in_order_within_clip_and_image(seed: int, a: float, b: float
         found = stream.events  # checked as it is read
     assert (np.diff(found.t) >= 0).all() and ((found.t >= 0) & (found.t < TICKS * 50)).all()
     assert (found.x < WIDTH).all() and (found.y < HEIGHT).all() and set(np.unique(found.p)) <= {0, 1}
-    assert ((stream.ticks >= 0) & (stream.ticks < TICKS)).all()
-    assert (np.abs(stream.ticks * 50 + 25 - found.t) <= 25).all()
     start, stop = min(a, b), max(a, b)
     part = stream.between(start, stop)
     inside = (found.t >= start) & (found.t < stop)
@@ -80,6 +78,8 @@ def test_events_are_in_order_within_clip_and_image(seed: int, a: float, b: float
     ("change", "message"),
     [
         ({"t": np.array([5, 1])}, "events in order of time"),
+        ({"t": np.array([500, 3], np.uint32)}, "events in order of time"),
+        ({"t": np.array([500, 3], np.uint64)}, "events in order of time"),
         ({"t": np.array([1, 4000])}, r"t of every event in \[0, 4000\)"),
         ({"t": np.array([-1, 5])}, "t of every event"),
         ({"x": np.array([3, WIDTH], np.uint16)}, "x of every event in"),

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,12 @@ def test_training_holds_the_training_cameras_only(small_scene: Path) -> None:
     assert len(training.streams) == 3 and training.radiance_gain == GAIN
     assert training.duration_us == 4000.0
     assert [training.tick(t) for t in (-5.0, 0.0, 49.9, 50.0, 3999.0, 9999.0)] == [0, 0, 0, 1, 79, 79]
+
+
+@pytest.mark.parametrize("rate_hz", [15_000.0, 25_000.0, 30_000.0, 50_000.0])
+def test_the_time_of_a_tick_is_in_that_tick(small_scene: Path, rate_hz: float) -> None:
+    training = replace(open_scene(small_scene).training, rate_hz=rate_hz, n_ticks=2000)
+    assert [training.tick(t * 1e6 / rate_hz) for t in range(2000)] == list(range(2000))
 
 
 def test_the_colmap_model_has_the_same_cameras(small_scene: Path) -> None:
@@ -142,6 +149,12 @@ GAP = {"camera": "cam_01", "first_tick": 7, "ticks": 2, "reason": "usb overflow"
         (one_split("cam_00", "cam_03"), "scene.json", "known, distinct cameras, found cam_03 in both parts"),
         (one_split("cam_00", "cam_77"), "scene.json", "found cam_77 without pose or stream"),
         (one_split(), "scene.json", "at splits/center/train"),
+        (set_meta(width=HEIGHT, height=WIDTH), "scene.json", "cameras of 24x40 pixels, found cam_00 of 40x24"),
+        (
+            edit_json("scene.json", lambda m: m["streams"].update(extra="spikes/cam_00.dat")),
+            "scene.json",
+            "expected a pose of every stream, found extra without",
+        ),
         (set_meta(splits={"../evil": {"train": ["cam_00"], "test": []}}), "scene.json", "'../evil' does not match"),
         (set_meta(gaps=[GAP]), "scene.json", "expected a recording without gaps, found 1 gap(s)"),
         (set_meta(gaps=[{"camera": "cam_01"}]), "scene.json", "at gaps/0"),

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 from run_command import run_benchmark
-from small_scenes import array_cameras, write_small_scene
+from small_scenes import HEIGHT, WIDTH, array_cameras, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget
@@ -25,7 +25,7 @@ from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import Split, spread_order, standard_splits
-from spike4dgs.benchmark.scene.writer import SceneDescription
+from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
 from spike4dgs.cli import main
 from spike4dgs.cli.submit import submit_all
 
@@ -181,6 +181,17 @@ def test_the_default_split_is_stated_once() -> None:
     )  # fmt: skip
     with pytest.raises(ValueError, match="center is"):
         _ = description.all_splits
+
+
+def test_cameras_of_two_sizes_become_no_scene(tmp_path: Path) -> None:
+    small, large = array_cameras(1)[0], array_cameras(2, 2 * WIDTH, HEIGHT)[1]
+    description = SceneDescription(
+        id="a", title="a", licence="a", cameras=(small, large), train=names(0, 1), test=(), rate_hz=1.0, n_ticks=1,
+        radiance_gain=1.0, targets=(), sensor={"model": "a", "rows_bottom_up": True}, source={"kind": "test"},
+    )  # fmt: skip
+    with pytest.raises(UserError, match="expected cameras of 40x24 pixels, found cam_01 of 80x24"):
+        finish_scene(tmp_path, description)
+    assert not list(tmp_path.iterdir())
 
 
 # ---------------------------------------------------------------- results
