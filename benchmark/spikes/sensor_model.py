@@ -43,9 +43,9 @@ class SensorModel:
     dark_median: float = 0.0045  # spikes per tick
     dark_log_spread: float = 0.46  # log-normal: 1st to 99th percentile from 0.0015 to 0.0128
     hot_share: float = 9e-4  # about one pixel in a thousand is hot
-    hot_factor: float = 5.0  # a hot pixel's dark rate is at least so many times the usual rate,
+    hot_factor: float = 5.0  # a hot pixel's dark rate is at least so many times its own log-normal one,
     hot_tail: float = 2.5  # beyond that a Pareto variable with this exponent,
-    hot_most: float = 50.0  # and at most so many times, the brightest seen
+    hot_most: float = 50.0  # and at most so many times
 
 
 SENSOR = SensorModel()

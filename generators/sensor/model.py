@@ -171,7 +171,7 @@ def simulate(
     with ThreadPoolExecutor(threads) as pool:
         for first in range(0, n_intervals, per_batch):
             last = min(first + per_batch, n_intervals)
-            _fill(window, keys, first, last, len(keys))
+            _fill(window, keys, first, last, len(keys), charge.shape)
             end = min(int(ticks[last]), n_ticks)
             words = np.empty((end - ticks[first], blocks), dtype=np.uint64)
             batch = window, ticks[first : last + 1], tangents[first:last]
@@ -231,7 +231,7 @@ def _stored_map(image: Float32 | None, off: float, blocks: int) -> Float32:
     return stored
 
 
-def _fill(window: Float32, keys: Keys, first: int, last: int, n_keys: int) -> None:
+def _fill(window: Float32, keys: Keys, first: int, last: int, n_keys: int, shape: tuple[int, ...]) -> None:
     """Put keys first - 1 .. last + 1 (repeated at the clip's ends) into rows 0 .. of `window`."""
     kept = 0
     if first > 0:  # the last three rows of the batch before are the first three of this one
@@ -240,6 +240,8 @@ def _fill(window: Float32, keys: Keys, first: int, last: int, n_keys: int) -> No
     for row in range(kept, last - first + 3):
         k = min(max(first - 1 + row, 0), n_keys - 1)
         image = np.asarray(keys[k], dtype=np.float32)
+        if image.shape != shape:
+            raise problem(f"key frame {k}", f"[H, W] = {shape}", str(image.shape), "use one resolution for all")
         if not np.isfinite(image).all():  # as an integer charge it would be any number
             raise problem(f"key frame {k}", "finite radiance", "NaN or infinity", "render it again")
         _store(image, window[row])

@@ -233,6 +233,13 @@ def test_bad_input_is_named():
         list(simulate(keys, ticks, n, Sensor(gain=np.ones((2, 2), np.float32)), charge))
 
 
+@pytest.mark.parametrize("shape", [(64, 40), (60, 64)])
+def test_keys_of_another_shape_are_refused(shape):
+    keys = [np.zeros((40, 64), np.float32), np.zeros(shape, np.float32)]
+    with pytest.raises(UserError, match=r"key frame 1: expected \[H, W\] = \(40, 64\), found \(6"):
+        list(simulate(keys, [0, 20], 20, Sensor(), random_charge(40, 64, [0])))
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_radiance_that_is_not_finite_is_refused(value):
     keys, ticks, n = scene()
