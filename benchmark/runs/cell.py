@@ -68,20 +68,15 @@ class Job:
     @property
     def key(self) -> str:
         """The content key under which predictions are found again; it covers the code of other packages' methods."""
-        code = code_of(self.method)
-        return sha256_json(
-            {
-                **({"code": code} if code else {}),
-                "method": replace(self.info, given=None).as_dict(),
-                "harness": harness()["version"],
-                "scene": self.scene.id,
-                "revision": self.scene.revision,
-                "split": self.scene.split,
-                "protocol": PROTOCOL,
-                "budget": self.budget.label,
-                "device": device_type(self.device),
-            }
-        )
+        return self.key_on(self.scene.id, self.scene.revision)
+
+    def key_on(self, scene: str, revision: str) -> str:
+        """Return the key of this job on another scene, by its id and revision, with the same split."""
+        code = {"code": found} if (found := code_of(self.method)) else {}
+        method = {"method": replace(self.info, given=None).as_dict(), "harness": harness()["version"]}
+        where = {"scene": scene, "revision": revision, "split": self.scene.split}
+        fit = {"protocol": PROTOCOL, "budget": self.budget.label, "device": device_type(self.device)}
+        return sha256_json({**code, **method, **where, **fit})
 
 
 def is_done(job: Job, folder: Path) -> bool:

@@ -6,7 +6,7 @@ and a scene without a value makes the mean null, never smaller.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -128,11 +128,12 @@ def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str
     return ShownRecord(record)
 
 
-def with_earlier_scenes(record: Record, path: Path) -> Record:
+def with_earlier_scenes(record: Record, path: Path, is_same_fit: Callable[[str, str], bool]) -> Record:
     """Return a record with the cells of further scenes that the record at `path` has of the same method and split.
 
-    A record of another version, seed, budget or other parameters, one with another protocol, and a file that is none
-    are without effect.
+    `is_same_fit(scene, revision)` tells whether the scores of a scene are those of a fit like the record's: scores of
+    other code or another kind of device are left out. A record of another version, seed, budget or other parameters,
+    one with another protocol, and a file that is none are without effect.
     """
     try:
         earlier = read_record(path)
@@ -142,7 +143,12 @@ def with_earlier_scenes(record: Record, path: Path) -> Record:
     same = same and earlier["harness"]["version"] == record["harness"]["version"]
     budgets = {cell["budget"] for r in (earlier, record) for cell in r["scenes"].values() if cell["status"] == "ok"}
     same = same and len(budgets) <= 1
-    added = {scene: cell for scene, cell in earlier["scenes"].items() if scene not in record["scenes"]}
+    revisions = earlier["dataset"]["scenes"]
+    added = {
+        scene: cell
+        for scene, cell in earlier["scenes"].items()
+        if scene not in record["scenes"] and (cell["status"] != "ok" or is_same_fit(scene, revisions[scene]))
+    }
     if not same or not added or earlier["dataset"]["split"] != record["dataset"]["split"]:
         return record
     return _with_cells(record, {**added, **record["scenes"]}, earlier)

@@ -17,12 +17,13 @@ import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from uuid import uuid4
 
 from rich.console import Console
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import locked, remove_parts, write_text
 from spike4dgs.benchmark.method import Budget, Method, no_progress
 from spike4dgs.benchmark.metrics.measure import AUTO, Selection, select_metrics
@@ -31,7 +32,7 @@ from spike4dgs.benchmark.runs.apart.fit import Apart, fit_job
 from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, why_not_kept
 from spike4dgs.benchmark.runs.display import RunDisplay, ShownCell, cell_summary
 from spike4dgs.benchmark.runs.executors import WORKERS_DIED, RunUnordered, unordered_executor
-from spike4dgs.benchmark.runs.predictions import open_predictions
+from spike4dgs.benchmark.runs.predictions import open_predictions, read_info
 from spike4dgs.benchmark.runs.record import (
     Cell,
     Record,
@@ -253,10 +254,18 @@ def _write_records(
         by_scene = {scene.id: cell for scene, cell in zip(scenes, cells, strict=True)}
         record = build_record(info, scenes, by_scene, device)
         path = files.out / "results" / f"{info.name}.json"
-        record = with_earlier_scenes(record, path)
+        record = with_earlier_scenes(record, path, partial(_is_same_fit, files, info.name))
         write_record(path, record)
         records.append(record)
     return records
+
+
+def _is_same_fit(files: JobFiles, method: str, scene: str, revision: str) -> bool:
+    """Return whether the predictions of a variant that a run keeps of another scene are of the job's fit."""
+    try:
+        return read_info(predictions_folder(files.out, method, scene)).key == files.job.key_on(scene, revision)
+    except UserError:
+        return False
 
 
 def check_inputs(scene: Scene) -> None:

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -60,10 +61,9 @@ def test_what_is_kept_and_what_is_replaced_says_why_and_refit_fits_anew(small_sc
     assert "fitted anew (--refit)" in notes(again, seed=2, refit=True) and again.fits == 1
 
 
-def test_edited_code_of_a_plug_in_is_fitted_and_scored_anew(
-    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A package whose helper module changes, installed again in the same version."""
+@pytest.fixture
+def plug_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], CountMethod]:
+    """Return the method of a package whose helper module changes, installed again in the same version."""
     package = tmp_path / "edited_plug_in"
     package.mkdir()
     (package / "__init__.py").write_text(
@@ -75,16 +75,39 @@ def test_edited_code_of_a_plug_in_is_fitted_and_scored_anew(
         "        return model\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    scores = []
-    for level in (1.0, 0.5, 0.5):
+
+    def install(level: float) -> CountMethod:
         (package / "model.py").write_text(f"LEVEL = {level}  # of the images\n")
         for name in [m for m in sys.modules if m.startswith("edited_plug_in")]:
             del sys.modules[name]
         importlib.invalidate_caches()
         shutil.rmtree(package / "__pycache__", ignore_errors=True)
-        method = importlib.import_module("edited_plug_in").Method()
+        method: CountMethod = importlib.import_module("edited_plug_in").Method()
+        return method
+
+    return install
+
+
+def test_edited_code_of_a_plug_in_is_fitted_and_scored_anew(
+    small_scene: Path, tmp_path: Path, plug_in: Callable[[float], CountMethod]
+) -> None:
+    scores = []
+    for level in (1.0, 0.5, 0.5):
+        method = plug_in(level)
         scores.append((run(tmp_path / "out", [small_scene], method)[0]["mean"]["psnr"], method.fits))
     assert [fits for _, fits in scores] == [1, 1, 0] and scores[0] != scores[1] and scores[1][0] == scores[2][0]
+
+
+def test_a_record_has_no_scores_of_other_code_beside_its_own(
+    small_scene: Path, tmp_path: Path, plug_in: Callable[[float], CountMethod]
+) -> None:
+    other = write_small_scene(tmp_path / "other", seed=1)
+    run(tmp_path / "out", [small_scene, other], plug_in(1.0))
+    (same,) = run(tmp_path / "out", [small_scene], plug_in(1.0))
+    assert list(same["scenes"]) == ["pattern-1", "pattern-0"]
+    (edited,) = run(tmp_path / "out", [small_scene], plug_in(0.5))
+    assert list(edited["scenes"]) == ["pattern-0"]
+    assert edited["mean"]["psnr"] == edited["scenes"]["pattern-0"]["metrics"]["psnr"]
 
 
 def test_a_method_of_this_package_has_no_code_in_its_key() -> None:
