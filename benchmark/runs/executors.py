@@ -105,8 +105,9 @@ def _pool(task: Callable[[Any], Any], workers: int) -> Iterator[ProcessPoolExecu
         fix = "run the same command again, with fewer --workers if memory ran out"
         raise problem("a worker process", "that it ends its task", "it died (out of memory, or killed)", fix) from None
     finally:
+        running = list((pool._processes or {}).values())  # the shutdown forgets them
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in (pool._processes or {}).values():  # what is running would only be thrown away
+        for process in running:  # what it does would only be thrown away
             process.terminate()
 
 

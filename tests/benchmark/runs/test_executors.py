@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from dummy_methods import wait_for
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs import executors
@@ -81,18 +82,34 @@ def test_errors_of_tasks_come_through():
         list(run(fail, [[1], [2]]))
 
 
+def has_ended(pid):
+    status = Path(f"/proc/{pid}/status")
+    return not status.exists() or "zombie" in status.read_text()
+
+
 def test_workers_end_with_a_run_that_is_given_up():
     with executor(2) as run:
         results = run(Square(), [[k] for k in range(50)])
         pid = next(results)[2]
         results.close()
-    for _ in range(100):
-        status = Path(f"/proc/{pid}/status")
-        if not status.exists() or "zombie" in status.read_text():
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("the worker still runs")
+    wait_for(lambda: has_ended(pid), 30)
+
+
+def fail_beside_a_long_task(chunk):
+    """Fail once the task of the other worker runs, which lasts longer than a test waits."""
+    path, fails = chunk
+    if fails:
+        wait_for(lambda: path.is_file() and path.read_text())
+        raise UserError("cam_00: expected light, found none. Switch it on")
+    path.write_text(f"{os.getpid()}")
+    time.sleep(90)
+
+
+def test_a_worker_at_work_ends_after_the_error_of_another(tmp_path):
+    path = tmp_path / "pid"
+    with executor(2) as run, pytest.raises(UserError, match="Switch it on"):
+        list(run(fail_beside_a_long_task, [(path, False), (path, True)]))
+    wait_for(lambda: has_ended(int(path.read_text())), 30)
 
 
 def test_a_scheduler_that_does_not_answer_is_one_error(monkeypatch):
