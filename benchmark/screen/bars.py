@@ -32,8 +32,10 @@ class Pace:
         self._last = (0.0, 0.0, 0.0)  # done, total, when
 
     def at(self, done: float, total: float) -> None:
-        """Take note of `done` steps of `total`."""
+        """Take note of `done` steps of `total`; fewer than before begin another stage."""
         now = self._clock()
+        if done < self._last[0]:
+            self._first, self._begun = None, now
         if self._first is None and done > 0:
             self._first = done, now
         self._last = done, total, now

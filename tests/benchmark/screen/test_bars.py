@@ -57,6 +57,15 @@ def test_a_step_that_lasts_lets_the_estimate_count_down() -> None:
     assert pace.left() == 7.0
 
 
+def test_a_second_stage_of_as_many_steps_has_an_estimate_of_its_own() -> None:
+    clock = Clock()
+    pace = Pace(clock)
+    for now, done, left in ((50.0, 5, 50.0), (60.0, 0, None), (61.0, 1, 9.0), (63.0, 2, 16.0)):
+        clock.now = now
+        pace.at(done, 10)
+        assert pace.left() == left
+
+
 def run_cells(monkeypatch, cells: list[tuple[str, float, bool]], typical_s=None) -> list[float | None]:
     """Run cells of (method, seconds, fitted); return the estimates after each but the last."""
     clock, estimates = Clock(), []
