@@ -55,7 +55,8 @@ _CODE = (
     "from spike4dgs.benchmark.runs.apart.child import main; sys.exit(main())"
 )
 _HIDDEN = (RELEASE, "OLDPWD")  # variables that tell where scenes lie
-_FOLDERS = ("SPIKE4DGS_", "TORCH_HOME", "XDG_CACHE_HOME")  # beginnings of variables that name folders
+_FOLDERS = ("SPIKE4DGS_", "TORCH_HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR")  # beginnings of variables of folders
+_WORDS = ("SPIKE4DGS_MITSUBA_VARIANT",)  # that begin so and name none
 _END_S = 5.0  # for a process to end by itself
 WORK, PART = "{work}", "{part}"  # in a container's command
 
@@ -237,5 +238,6 @@ def _started(part: Path, work: Path, apart: Apart) -> Iterator[subprocess.Popen[
 def _environment(part: Path) -> dict[str, str]:
     """Return the variables of the process: those of this one, paths absolute, without what tells where scenes lie."""
     kept = {name: value for name, value in os.environ.items() if name not in _HIDDEN}
-    folders = {name: str(Path(value).absolute()) for name, value in kept.items() if value and name.startswith(_FOLDERS)}
+    named = {name: value for name, value in kept.items() if value and name.startswith(_FOLDERS) and name not in _WORDS}
+    folders = {name: str(Path(value).expanduser().absolute()) for name, value in named.items()}
     return {**kept, **folders, "PWD": str(part)}

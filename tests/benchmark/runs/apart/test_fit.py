@@ -24,7 +24,7 @@ from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, get_method
-from spike4dgs.benchmark.runs.apart.fit import Apart, _training_part, fit_apart
+from spike4dgs.benchmark.runs.apart.fit import Apart, _environment, _training_part, fit_apart
 from spike4dgs.benchmark.runs.apart.messages import packed_method, unpacked_method
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
@@ -115,6 +115,28 @@ def test_what_a_fit_sees_has_neither_the_held_out_camera_nor_how_the_scene_was_m
     ], "poses to the last bit"
     captured = capfd.readouterr()
     assert "printed to standard output" in captured.err and "printed" not in captured.out
+
+
+def test_a_fit_reads_the_folders_that_the_callers_variables_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    variables = {
+        "HOME": "/home/someone",
+        "TORCH_HOME": "~/hub",
+        "SPIKE4DGS_WEIGHTS": "weights",
+        "NUMBA_CACHE_DIR": "kernels",
+        "SPIKE4DGS_MITSUBA_VARIANT": "llvm_ad_rgb",
+    }
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    found = _environment(tmp_path / "part")
+    assert {name: found[name] for name in variables} == {
+        **variables,
+        "TORCH_HOME": "/home/someone/hub",
+        "SPIKE4DGS_WEIGHTS": str(tmp_path / "weights"),
+        "NUMBA_CACHE_DIR": str(tmp_path / "kernels"),
+    }
 
 
 @pytest.mark.parametrize("split", ["corner", "views-3"])
