@@ -13,7 +13,6 @@ A recipe overrides the numbers of its parts by name, PART.NAME:
 from __future__ import annotations
 
 import inspect
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.plugins import Plugin, find_plugins
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -58,6 +58,7 @@ DEFAULT_BUDGET = "quick"
 SCALES = {"quick": 1.0, "standard": 4.0}  # quick: at most 90 s a fit on two cores, 200x125 pixels, 20 ms
 PAPER = "paper"
 MAX_BUDGET = 1e6  # as in common.schema.json
+MAX_SETTINGS = 100  # characters of the settings in a name, as in common.schema.json
 
 
 @dataclass(frozen=True)
@@ -209,7 +210,8 @@ def get_method(name: str, methods: Mapping[str, Method] | None = None) -> Method
 def with_settings(method: Method, settings: Sequence[str]) -> Method:
     """Return a method with other settings, each PART.NAME=VALUE; its name states them: NAME[PART.NAME=VALUE,...].
 
-    Raises UserError where the method has no `with_settings` or no such setting, and for a value of another type.
+    Raises UserError where the method has no `with_settings` or no such setting, for a value of another type, and where
+    the name would be none: for settings of more than 100 characters, and beside settings that the name states.
     """
     overrides: dict[str, Any] = {}
     for text in settings:
@@ -217,8 +219,8 @@ def with_settings(method: Method, settings: Sequence[str]) -> Method:
         if not equals or not re.fullmatch(r"[A-Za-z0-9+._-]+", value):
             raise problem("--set", "PART.NAME=VALUE, such as motion.lr_grid=0.005", repr(text), "correct it")
         try:
-            overrides[name] = json.loads(value)
-        except json.JSONDecodeError:
+            overrides[name] = parse_json(value)
+        except ValueError:
             overrides[name] = value  # a word
     if not overrides:
         return method
@@ -226,7 +228,12 @@ def with_settings(method: Method, settings: Sequence[str]) -> Method:
     if change is None:
         fix = "choose a method that `spike4dgs methods NAME` shows settings of"
         raise problem("--set", "a method that is made of settings", f"{method.name}, which has none", fix)
-    changed: Method = change(overrides, f"{method.name}[{','.join(settings)}]")
+    stated = ",".join(settings)
+    if is_changed(method.name) or len(stated) > MAX_SETTINGS:
+        found = f"{method.name} with {stated[:200]}, {len(stated)} characters"
+        fix = "write numbers shorter, and all in METHOD[...] or all in --set"
+        raise problem("--set", f"settings of {MAX_SETTINGS} characters at most, in one list", found, fix)
+    changed: Method = change(overrides, f"{method.name}[{stated}]")
     return changed
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -89,6 +90,14 @@ def test_a_method_with_other_settings_has_them_in_its_name_and_parameters() -> N
         ("tfp+4dgs", "lr_grid=1", "expected settings named PART.NAME"),
         ("tfp+4dgs", "motion.lr_grid", "--set: expected PART.NAME=VALUE"),
         ("tfp+4dgs", "motion.lr_grid=many", "expected motion.lr_grid as float, found 'many'"),
+        ("tfp+4dgs", "motion.lr_grid=NaN", "expected motion.lr_grid as float, found 'NaN'"),
+        ("tfp+4dgs", "motion.lr_grid=1e999", "expected motion.lr_grid as float, found '1e999'"),
+        ("tfp+4dgs", f"trainer.fine_steps={10**29}", "expected trainer.fine_steps as int, found '1000"),
+        (
+            "tfp+4dgs",
+            f"motion.lr_grid=0.{'0' * 90}1",
+            "--set: expected settings of 100 characters at most, in one list",
+        ),
         ("tfp+4dgs", "motion.lr_grid=../x", "--set: expected PART.NAME=VALUE"),
         ("nearest-view", SET, "expected a method that is made of settings, found nearest-view"),
     ],
@@ -96,6 +105,12 @@ def test_a_method_with_other_settings_has_them_in_its_name_and_parameters() -> N
 def test_settings_that_a_method_does_not_have_are_refused(method: str, setting: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
         with_settings(METHODS[method], (setting,))
+
+
+def test_settings_beside_those_of_a_name_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = f"tfp+4dgs[{SET}]"
+    assert main(["fit", str(tmp_path), "--method", name, "--set", "motion.tv_weight=0.1"]) == 2
+    assert "in one list, found tfp+4dgs[motion.lr_grid=0.005] with motion.tv_weight=0.1" in capsys.readouterr().err
 
 
 def test_a_setting_of_the_recipes_own_value_is_refused() -> None:
