@@ -88,7 +88,7 @@ def is_done(job: Job, folder: Path) -> bool:
         predictions.verify()
     except UserError:
         return False  # damaged since: made again
-    return predictions.info.key == job.key
+    return _is_of(job, predictions.info)
 
 
 def why_not_kept(job: Job, folder: Path) -> str | None:
@@ -97,13 +97,14 @@ def why_not_kept(job: Job, folder: Path) -> str | None:
         info = open_predictions(folder, job.scene.targets).info
     except UserError:
         return None
-    if info.key is None or info.key == job.key:
+    if info.key is None or _is_of(job, info):
         return None
     mine, theirs, scene = job.info, info.method, job.scene
     differs = {
         "version": mine.version != theirs.version,
         "seed": mine.seed != theirs.seed,
         "trained_on": mine.trained_on != theirs.trained_on,
+        "given": theirs.given not in (None, mine.given),
         "settings": mine.params != theirs.params,
         "revision of the scene": scene.revision != info.scene_revision,
         "split": scene.split != info.split,
@@ -111,6 +112,11 @@ def why_not_kept(job: Job, folder: Path) -> str | None:
         "device": device_type(job.device) != device_type(info.device or ""),
     }
     return "another " + (", ".join(what for what, other in differs.items() if other) or "code of the method")
+
+
+def _is_of(job: Job, info: PredictionInfo) -> bool:
+    """Return whether predictions are of this job; the key leaves out what was given, which older ones do not state."""
+    return info.key == job.key and info.method.given in (None, job.info.given)
 
 
 @dataclass(frozen=True)

@@ -64,6 +64,11 @@ class Settings:
     typical_s: Mapping[str, float] = field(default_factory=dict)  # of fits by method, somewhere: their ratios count
     apart: Apart | None = None  # fits have a process each, which sees the training part alone; None: they see all
 
+    @property
+    def spreads(self) -> bool:
+        """Whether workers fit, several cells at once."""
+        return self.workers != 1 or self.scheduler is not None
+
     def folder(self, seed: int) -> Path:
         """Return the folder that keeps what comes of a seed."""
         return self.out if seed == self.seed else self.out / f"seed-{seed}"
@@ -154,9 +159,10 @@ def run_matrix(
     ]
     found: dict[int, list[Cell]] = {}
     records: dict[int, list[Record]] = {}
+    kinds = [] if settings.spreads else [files.job.method.name for files in jobs]
     with (
         locked(settings.out / ".lock", settings.out, "a folder that no other run uses"),
-        RunDisplay(console, len(jobs), [files.job.method.name for files in jobs], settings.typical_s) as display,
+        RunDisplay(console, len(jobs), kinds, settings.typical_s) as display,
     ):
         remove_parts(settings.out)
         for k, cells in run_cells(jobs, settings, selection, display):
@@ -172,13 +178,13 @@ def run_cells(
     jobs: Sequence[JobFiles], settings: Settings, selection: Selection, display: RunDisplay
 ) -> Iterator[tuple[int, list[Cell]]]:
     """Run or resume the cells, here or by workers. Yield their positions and the cells of their variants."""
-    if settings.workers == 1 and settings.scheduler is None:
+    if settings.spreads:
+        with unordered_executor(settings.workers, settings.scheduler) as run:
+            yield from _spread(jobs, settings.out, run, selection, display)
+    else:
         for k, files in enumerate(jobs):
             with display.cell(files.title) as shown:
                 yield k, _settle(files, fit_here(files, shown), selection, shown)
-    else:
-        with unordered_executor(settings.workers, settings.scheduler) as run:
-            yield from _spread(jobs, settings.out, run, selection, display)
 
 
 def fit_here(files: JobFiles, shown: ShownCell) -> Failure | None:

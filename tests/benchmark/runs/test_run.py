@@ -47,18 +47,43 @@ def test_a_second_run_scores_the_files_and_fits_nothing(small_scene: Path, tmp_p
     assert not list((tmp_path / "out/work").iterdir()), "checkpoints of finished fits go"
 
 
-def test_what_is_kept_and_what_is_replaced_says_why_and_refit_fits_anew(small_scene: Path, tmp_path: Path) -> None:
-    def notes(*methods: Any, **settings: Any) -> str:
+@pytest.fixture
+def notes(small_scene: Path, tmp_path: Path) -> Callable[..., str]:
+    """Return a function that runs methods on a scene, and returns what is printed."""
+
+    def run_noted(*methods: Any, **settings: Any) -> str:
         console = Console(file=(text := io.StringIO()), width=200)
         out = Settings(tmp_path / "out", metrics=("psnr",), **settings)
         run_matrix([open_scene(small_scene)], methods, out, console)
         return text.getvalue()
 
+    return run_noted
+
+
+def test_what_is_kept_and_what_is_replaced_says_why_and_refit_fits_anew(notes: Callable[..., str]) -> None:
     assert "kept" not in notes(CountMethod()) and "kept: predictions of 2" in notes(CountMethod())
     assert "replaces predictions with another settings" in notes(CountMethod(extra=1))
     assert "replaces predictions with another seed, settings" in notes(CountMethod(), seed=2)
     again = CountMethod()
     assert "fitted anew (--refit)" in notes(again, seed=2, refit=True) and again.fits == 1
+
+
+def test_predictions_of_a_method_that_was_given_more_are_replaced(notes: Callable[..., str]) -> None:
+    more, less, again = CountMethod(), CountMethod(), CountMethod()
+    more.given = ("poses", "flat-field", "frames")  # type: ignore[attr-defined]
+    less.given = again.given = ("poses",)  # type: ignore[attr-defined]
+    assert notes(CountMethod()) and "kept" in notes(more), "predictions that do not say what was given stay valid"
+    assert "kept" not in notes(more, refit=True)
+    assert "replaces predictions with another given" in notes(less) and less.fits == 1
+    assert "kept" in notes(again) and again.fits == 0
+
+
+def test_the_time_left_of_cells_that_workers_fit_follows_the_elapsed_time(notes: Callable[..., str]) -> None:
+    notes(CountMethod(), seeds=3)
+    typical_s = {"counts": 1e6}
+    assert " h " in notes(CountMethod(), seeds=3, typical_s=typical_s), "one after another, as long as is typical"
+    spread = notes(CountMethod(), seeds=3, typical_s=typical_s, workers=2)
+    assert spread.count(" left") == 2 and " h " not in spread
 
 
 @pytest.fixture
