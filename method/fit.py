@@ -128,7 +128,7 @@ class RecipeMethod(Shown):
             expected, named = "parts that take nothing of spikes", f"{recipe.initialization}, {recipe.supervision}"
             raise problem(f"recipe {self.name}", expected, named, "change them, or the images")
         self.description = description or describe(recipe, parts, self.algorithm)
-        weights, self.trained_on = learned_facts(self.images.learned(), self.initialization.learned())
+        weights, self.trained_on = learned_facts(self.images.learned(), self.initialization.networks)
         self.params |= weights
         self._warm: set[str] = set()  # the devices whose kernels are compiled
 

@@ -6,7 +6,6 @@ images and points.
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from spike4dgs.method.images.intervals import INTERVALS
 from spike4dgs.method.matching.weights import WEIGHTS as MATCHER
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.msdi.weights import WEIGHTS as POINTS
-from spike4dgs.method.starts.base import Initialization, other_weights
+from spike4dgs.method.starts.base import Initialization
 from spike4dgs.method.starts.matching import MatchedSettings, matched
 from spike4dgs.method.starts.msdi import MsdiSettings, msdi
 from spike4dgs.method.starts.rig import RigSettings, rig
@@ -37,7 +36,7 @@ PARTS = Parts(
             MsdiSettings(),
             label="points by MSDI",
             calibrated=True,
-            learned=partial(other_weights, POINTS),
+            networks=(POINTS,),
         ),
         "matched": Initialization(
             lambda r: matched(r.scene, r.seed, r.settings, r.device),
@@ -45,7 +44,7 @@ PARTS = Parts(
             label="poses by the matching network and features",
             estimates_poses=True,
             calibrated=True,
-            learned=partial(other_weights, MATCHER, POINTS),
+            networks=(MATCHER, POINTS),
         ),
     },
     motion=MOTIONS,

@@ -57,23 +57,20 @@ class Initialization:
     estimates_poses: bool = False  # those given serve for nothing but the frame
     calibrated: bool = False  # takes the cameras' calibrations, whether `flat_field` or not
     from_recorded: bool = False  # takes images of other sensors where a recipe has some
-    learned: Callable[[], tuple[Learned, ...]] = tuple  # weights in use in place of the included ones
+    networks: tuple[WeightKind[Any], ...] = ()  # that it runs
 
 
-def other_weights(*kinds: WeightKind[Any]) -> tuple[Learned, ...]:
-    """Return the weights of these networks that are in use in place of the included ones, as far as they can be read.
+def learned_facts(images: Learned | None, start: Sequence[WeightKind[Any]]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return what a method's parameters say of the weights of its images and of its start's networks, with their data.
 
-    The package's version names the included ones, which have seen nothing that is scored.
+    Of a start they name the weights in use in place of the included ones, as far as they can be read. The package's
+    version names the included ones, which have seen nothing that is scored.
     """
-    found = [(kind, learned_from(kind.in_use, kind.read_card)) for kind in kinds]
-    return tuple(used for kind, used in found if used and used.sha256 != FoundWeights(kind.shipped).sha256)
-
-
-def learned_facts(images: Learned | None, start: Sequence[Learned]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return what a method's parameters say of the weights of its images and its start, and what these have seen."""
+    found = [(kind, learned_from(kind.in_use, kind.read_card)) for kind in start]
+    others = [used for kind, used in found if used and used.sha256 != FoundWeights(kind.shipped).sha256]
     facts: dict[str, Any] = {"weights_sha256": images.sha256} if images else {}
-    facts |= {"start_weights_sha256": [used.sha256 for used in start]} if start else {}
-    seen = [name for used in (*([images] if images else ()), *start) for name in used.trained_on]
+    facts |= {"start_weights_sha256": [used.sha256 for used in others]} if others else {}
+    seen = [name for used in (*([images] if images else ()), *others) for name in used.trained_on]
     return facts, tuple(dict.fromkeys(seen))
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import combinations
 
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import make_budget
-from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
-from spike4dgs.method.recipes import METHODS as OURS
-from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.kit.timing import markdown
+from spike4dgs.studies.results.changes import kind_of
 from spike4dgs.studies.results.comparison import BOTH, RANKED_BY, MeasuredRow, Ranking, lead, rank, rows_of
 from spike4dgs.studies.results.plan import ALL_ROWS, KNOWLEDGE, TABLE1, TABLE2, Group, cells_of
 from spike4dgs.studies.results.records import DIGITS, Record
@@ -265,16 +264,18 @@ def _commit(record: Record) -> str:
 
 
 def _mixed_code(own: Iterable[Record]) -> list[str]:
-    """Return a sentence that names the rows of each commit where the methods' code differs between them."""
-    codes: dict[str, set[str]] = {}
+    """Return a sentence that names the rows of each commit where the methods' code differs between them.
+
+    Digests of two kinds cannot be compared: of ours alone, or of others alone, two commits then count as other code.
+    """
+    codes: dict[str, set[tuple[tuple[str, ...], str, str]]] = {}
     by_commit: dict[str, dict[str, None]] = {}
     for r in own:
-        # Digests of methods in `method` leave the baselines out; those of tuned rows cover their settings.
-        row = r["row"].removesuffix(REFINED).partition("[")[0]
-        kind = row if is_tuned(row) else "ours" if row in OURS else "theirs"
-        codes.setdefault(kind, set()).add(r["code"])
-        by_commit.setdefault(_commit(r), {})[f"`{r['row']}`"] = None
-    if all(len(found) <= 1 for found in codes.values()):
+        kind, commit = kind_of(r["row"]), _commit(r)
+        codes.setdefault(kind[0], set()).add((kind, commit, r["code"]))
+        by_commit.setdefault(commit, {})[f"`{r['row']}`"] = None
+    pairs = (pair for found in codes.values() for pair in combinations(found, 2))
+    if not any(a[2] != b[2] and (a[0] == b[0] or a[1] != b[1]) for a, b in pairs):
         return []
     texts = [f"{commit}: {', '.join(rows)}" for commit, rows in by_commit.items()]
     return [f"**The methods' code differs**: {'; '.join(texts)}."]

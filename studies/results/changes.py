@@ -4,10 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.baselines.recipes import INITIALIZATIONS
+from spike4dgs.baselines.recipes import METHODS as THEIRS
 from spike4dgs.benchmark.runs.refinement import SUFFIX as REFINED
+from spike4dgs.method.fit import RecipeMethod
+from spike4dgs.method.recipes import METHODS as OURS
+from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.results.comparison import MeasuredRow, changes
 
 OTHER_CODE = "†"
+_LEARNED = {
+    *(name for name, maker in IMAGES.items() if maker.made_on),  # networks alone have a choice of device
+    *(name for name, start in INITIALIZATIONS.items() if start.networks),
+}
+
+
+def kind_of(row: str) -> tuple[str, ...]:
+    """Return what a row's digests of code are of. Those of two kinds differ even where the code is equal."""
+    name = row.removesuffix(REFINED).partition("[")[0]
+    if is_tuned(name):
+        return (name,)  # they cover its settings
+    method = OURS.get(name) or THEIRS.get(name)
+    recipe = method.recipe if isinstance(method, RecipeMethod) else None
+    parts = (recipe.images, recipe.initialization) if recipe else (name.removesuffix(".images").partition("+")[0],)
+    return "ours" if name in OURS else "theirs", *(part for part in parts if part in _LEARNED)
 
 
 def change_text(row: MeasuredRow, other: MeasuredRow) -> str:

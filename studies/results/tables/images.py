@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from spike4dgs.baselines.images.published.makers import MAKERS as PUBLISHED
-from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.baselines.images.table import IMAGES, ImageMaker
 from spike4dgs.benchmark.reports.paper_tables import tau_of
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import Scene
@@ -49,11 +49,19 @@ TABLE6 = Group(
 )
 
 
+def maker_of(row: str) -> ImageMaker:
+    """Return the image maker of a row."""
+    return IMAGES[row.removesuffix(SUFFIX).removesuffix(_known(row))]
+
+
+def _known(row: str) -> str:
+    return next((knows for knows in (SHADED, CORRECTED) if row.endswith(f"{knows}{SUFFIX}")), "")
+
+
 def measure_images(row: str, scene: Scene) -> Record:
     """Return the part of a record that the images of a row tell: knowledge, metrics, images per second."""
-    name = row.removesuffix(SUFFIX)
-    knows = next((knows for knows in (SHADED, CORRECTED) if name.endswith(knows)), "")
-    maker, knowledge = IMAGES[name.removesuffix(knows)], CALIBRATED if knows == CORRECTED else UNCALIBRATED
+    maker, knows = maker_of(row), _known(row)
+    knowledge = CALIBRATED if knows == CORRECTED else UNCALIBRATED
     part: Record = {"knowledge": knowledge, "metrics": {}, **dict.fromkeys(COSTS)}
     cameras = _CAMERAS[knows](scene)
     if knows and len(cameras) < len(scene.test):

@@ -224,6 +224,21 @@ def test_other_code_commits_and_changes_are_named() -> None:
     assert "A processor, 2 cores and Another" in last(cpu="Another")
 
 
+def test_rows_with_networks_are_compared_with_those_of_the_same_weights_alone() -> None:
+    rows = ("tfp+stg", "spk2img+stg", "spk2img+4dgs", "spike4dgs-x", "spike4dgs")
+    group = replace(GROUP, rows=tuple(map(Row, rows)))
+
+    codes = {"spk2img+stg": "00000000000c", "spk2img+4dgs": "00000000000c", "spike4dgs": "00000000000d"}
+
+    def last(changed: str = "", **changes: str) -> str:
+        each = [record(row, s, 30) for row in rows for s in SCENES]
+        each = [r | {"code": codes.get(r["row"], r["code"])} for r in each]
+        return table_block(group, [r | changes if r["row"] == changed else r for r in each])[-1]
+
+    assert "code differs" not in last() and "code differs" in last("spk2img+4dgs", code="00000000000e")
+    assert "code differs" in last("spike4dgs", commit="decade000000"), "neither digests nor commits are equal"
+
+
 def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None:
     changes = ({"budget": 4.0}, {"split": "corner"}, {"scene": "car-0-small"}, {"row": "else"})
     assert table_block(GROUP, [{**record("a", SCENES[0], 30), **c} for c in changes]) == [NOTHING]

@@ -47,7 +47,8 @@ def test_the_code_of_ceilings_and_images_has_what_measures_them(monkeypatch: pyt
         code_state.code_digest(row)
     ceiling, baseline, image = hashed
     assert "spike4dgs.leaderboard.truth_check" in ceiling
-    assert set(image) - set(baseline) == {"spike4dgs.studies.images", "spike4dgs.studies.results.tables.images"}
+    scoring = {"images", "results.tables.images", "speed_error.images"}
+    assert set(image) - set(baseline) == {f"spike4dgs.studies.{name}" for name in scoring}
     assert "spike4dgs.generators" in ceiling and "spike4dgs.baselines" not in ceiling
     assert "spike4dgs.baselines" in baseline and "spike4dgs.generators" not in baseline
 

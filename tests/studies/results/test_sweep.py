@@ -14,7 +14,7 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
-from changes import leave_part
+from changes import flip_bit, leave_part
 from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, run, wait_for
 from nosy_methods import Refines
 from rich.console import Console
@@ -30,6 +30,9 @@ from spike4dgs.benchmark.release.fingerprint import compare, read_fingerprint, w
 from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard import tracks
+from spike4dgs.method.image_network.weights import WEIGHTS as IMAGE_NETWORK
+from spike4dgs.method.models.network_weights import ConfigWeights
+from spike4dgs.method.msdi.weights import WEIGHTS as MSDI
 from spike4dgs.studies.results import code_state as states
 from spike4dgs.studies.results.code_state import CodeState, check_clean, code_digest, code_state
 from spike4dgs.studies.results.command import Choice, results
@@ -301,6 +304,25 @@ def test_a_method_of_ours_does_not_change_with_the_baselines() -> None:
     ours, rooms = code_digest("spike4dgs-x"), [benchmark, method, baselines]
     assert sources_sha256(rooms[:2]).startswith(ours) and ours != code_digest("tfp+stg")
     assert sources_sha256(rooms).startswith(code_digest("tfp+stg")) and len(ours) == 12
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows", "others"),
+    [
+        (IMAGE_NETWORK, ("spike4dgs", "msdi+colmap+4dgs", "msdi.images", "msdi+shading.images"), ("spk2img+stg",)),
+        (MSDI, ("spike4dgs", "spike4dgs-uncalibrated"), ("msdi+colmap+4dgs", "msdi.images", "spike4dgs-x")),
+    ],
+)
+def test_a_network_with_other_weights_is_other_code_of_its_rows(
+    kind: ConfigWeights[Any], rows: tuple[str, ...], others: tuple[str, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "network.safetensors").write_bytes(kind.shipped.read_bytes())
+    flip_bit(tmp_path / "network.safetensors", -1)
+    before = {row: code_digest(row) for row in (*rows, *others)}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(kind.variable, str(tmp_path / "network.safetensors"))
+        changed = {row for row, digest in before.items() if code_digest(row) != digest}
+    assert changed == set(rows)
 
 
 def test_images_are_measured_without_a_fit_and_corrected_where_the_camera_is_known(folder: Path) -> None:
