@@ -12,7 +12,7 @@ from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.changes import kind_of
 from spike4dgs.studies.results.comparison import BOTH, RANKED_BY, MeasuredRow, Ranking, lead, rank, rows_of
 from spike4dgs.studies.results.plan import ALL_ROWS, KNOWLEDGE, TABLE1, TABLE2, Group, cells_of
-from spike4dgs.studies.results.records import DIGITS, Record
+from spike4dgs.studies.results.records import DIGITS, NOT_FINITE, Record
 
 NOTHING = "No cell of this table has been measured yet."
 NO_LEAD = "No row of ours and another with equal knowledge have been measured on all scenes yet."
@@ -241,12 +241,11 @@ def provenance(own: Sequence[Record], *groups: Group) -> str:
 
 
 def _finite(own: Sequence[Record]) -> str:
-    """Return whether all measured values are finite, and how many cells have a reason and no values."""
-    measured = [r for r in own if r["error"] is None]
-    odd = sum(not all(map(math.isfinite, r["metrics"].values())) for r in measured)
-    failed = len(own) - len(measured)
+    """Return whether all measured values are finite, and how many cells have another reason and no values."""
+    errors = [r["error"] for r in own if r["error"] is not None]
+    odd = sum(error.startswith(NOT_FINITE) for error in errors)
     finite = f", {odd} not finite" if odd else ", all finite"
-    return finite + f", and {failed} that failed" * bool(failed)
+    return finite + f", and {len(errors) - odd} that failed" * (len(errors) > odd)
 
 
 def _processors(own: Iterable[Record]) -> str:

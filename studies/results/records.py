@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ METRICS = (
 COSTS = ("fit_seconds", "render_fps", "peak_memory_mb")
 DIGITS = 12  # of hashes in records
 FAILED = "failed"  # the beginning of an error; the other is "skipped", such as for weights that are not there
+NOT_FINITE = f"{FAILED}: not finite"
 _MOST_ERROR = 300  # characters
 
 
@@ -45,6 +47,15 @@ def scores_of(cell: Scored) -> Record:
         **{name: None if (value := cell[name]) is None else short(value) for name in COSTS},
         "error": None if cell["status"] == "ok" else f"{cell['status']}: {cell['error']}"[:_MOST_ERROR],
     }
+
+
+def with_finite(part: Record) -> Record:
+    """Return the part of a record that a measurement tells, without metrics and with an error where one is not finite.
+
+    A record has no place for NaN and infinity.
+    """
+    odd = [name for name, value in part["metrics"].items() if not math.isfinite(value)]
+    return {**part, "metrics": {}, "error": f"{NOT_FINITE}: {', '.join(odd)}"} if odd else part
 
 
 def short(value: float) -> float:

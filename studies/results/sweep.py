@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
@@ -39,6 +39,7 @@ from spike4dgs.studies.results.records import (
     read_records,
     scores_of,
     short,
+    with_finite,
     write_row,
 )
 from spike4dgs.studies.results.scenes import revisions_of
@@ -68,7 +69,10 @@ class SweepSettings:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Cells that a sweep left: how many have no record, and a line for each that failed. Skipped ones are neither."""
+    """Cells that a sweep left: how many have no record, and a line for each that failed. Skipped ones are neither.
+
+    Among the failed are those that a quiet pass did not fit again, skipped or not.
+    """
 
     left: int
     failed: tuple[str, ...]
@@ -79,9 +83,9 @@ def sweep(
 ) -> Outcome:
     """Measure the cells that have no record yet, in their order.
 
-    In a quiet pass those whose record is of a busy one are fitted again, for their times. A cell that fails has a
-    record that says why, and is tried again by the next sweep. Raises UserError for damaged scenes, where another sweep
-    runs, and where the code changes meanwhile.
+    In a quiet pass those whose record is of a busy one are fitted again, for their times. A cell that fails keeps the
+    metrics that it had, or has a record that says why, and is tried again by the next sweep. Raises UserError for
+    damaged scenes, where another sweep runs, and where the code changes meanwhile.
     """
     if settings.quiet and settings.workers > 1:
         raise problem("--quiet", "one worker, which has the machine to itself", "--workers", "leave one of them out")
@@ -111,7 +115,7 @@ def sweep(
             console.print(f"--limit-hours {settings.limit_hours:g}: no further cell is begun")
         failed = [r for r in map(records.get, map(_key, here)) if r and (r["error"] or "").startswith(FAILED)]
         left = sum(_key(cell) not in records for cell in cells)
-        return Outcome(left, tuple(f"{r['row']} on {r['scene']}, seed {r['seed']}: {r['error']}" for r in failed))
+        return Outcome(left, (*map(_failure, failed), *kept.spared))
 
 
 def _open(cells: Iterable[Cell], folder: Path, console: Console) -> dict[tuple[str, str], Scene]:
@@ -144,7 +148,13 @@ def _key(cell: Cell) -> Key:
 
 
 def _is_done(record: Record | None, quiet: bool) -> bool:
-    return record is not None and record["error"] is None and (record["quiet"] or not quiet)
+    if record is None or record["error"] is not None:
+        return False
+    return record["quiet"] or not quiet or record["row"] == CEILING  # a ceiling has no times
+
+
+def _failure(record: Record) -> str:
+    return f"{record['row']} on {record['scene']}, seed {record['seed']}: {record['error']}"
 
 
 def _say_other_code(
@@ -158,7 +168,7 @@ def _say_other_code(
 
 @dataclass(frozen=True)
 class _Kept:
-    """What is known of the cells, and their records so far."""
+    """What is known of the cells, and their records so far. `spared`: failures that left a record as it was."""
 
     scenes: Mapping[tuple[str, str], Scene]  # by id and split
     revisions: Mapping[str, str]
@@ -166,9 +176,10 @@ class _Kept:
     state: CodeState
     settings: SweepSettings
     records: dict[Key, Record]
+    spared: list[str] = field(default_factory=list)
 
     def keep(self, cell: Cell, measured: Record) -> None:
-        """Write a measured cell into its row's file and into `records`.
+        """Write a measured cell into its row's file and into `records`; a failure takes the place of no metrics.
 
         Raises UserError where the code is no longer what was to be measured.
         """
@@ -188,10 +199,14 @@ class _Kept:
             **({"dirty": True} if self.state.dirty else {}),
             "code": found,
             "tuned_on": cell.tuned_on,
-            **measured,
+            **with_finite(measured),
             "quiet": self.settings.quiet,
             "cpu": cpu_name(),
         }
+        before = self.records.get(key_of(record))
+        if record["error"] is not None and before is not None and before["error"] is None:
+            self.spared.append(f"{_failure(record)}; its earlier record stays")
+            return
         self.records[key_of(record)] = record
         write_row(self.settings.records, cell.row, self.records.values())
 

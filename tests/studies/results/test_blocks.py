@@ -25,6 +25,7 @@ from spike4dgs.studies.results.blocks import (
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
 from spike4dgs.studies.results.pages import BLOCKS
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row, track_scenes
+from spike4dgs.studies.results.records import with_finite
 from spike4dgs.studies.results.tables.breaks import breaks_block
 from spike4dgs.studies.results.tables.conditions import (
     CONDITIONS,
@@ -369,7 +370,7 @@ def test_what_breaks_a_row_is_the_mildest_amount_that_costs_three_decibels():
 def test_pages_say_whether_all_values_are_finite_and_how_many_cells_failed():
     found = [record(OURS, s, 30.0) for s in CONDITIONS[0].scenes]
     assert "planned cells, all finite. " in conditions_block(found)[-1]
-    found[0]["metrics"]["psnr"] = float("nan")
+    found[0] = with_finite(found[0] | {"metrics": {"psnr": float("nan")}})
     failed = record("tfp+stg", CONDITIONS[0].scenes[0], 30.0) | {"error": "no points", "metrics": {}}
     assert " cells, 1 not finite, and 1 that failed." in conditions_block([*found, failed])[-1]
 

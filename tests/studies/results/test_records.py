@@ -11,7 +11,7 @@ from made_records import record
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.record import missing_cell
-from spike4dgs.studies.results.records import key_of, measured, read_records, scores_of, write_row
+from spike4dgs.studies.results.records import key_of, measured, read_records, scores_of, with_finite, write_row
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -35,6 +35,15 @@ def test_a_failed_cell_has_its_reason_and_no_metrics(tmp_path: Path) -> None:
     assert scores["metrics"] == {} and scores["fit_seconds"] is None and len(scores["error"]) == 300
     assert scores["error"].startswith("skipped: no weights no")
     assert measured(read_records(tmp_path)) == []
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_metric_that_is_not_finite_is_a_failure(value: float, tmp_path: Path) -> None:
+    odd = with_finite(record(metrics={"psnr": 30.0, "flip": value}))
+    write_row(tmp_path, odd["row"], [odd])
+    (kept,) = read_records(tmp_path).values()
+    assert kept["metrics"] == {} and kept["error"] == "failed: not finite: flip"
+    assert with_finite(record()) == record()
 
 
 @pytest.mark.parametrize(

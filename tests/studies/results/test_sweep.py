@@ -14,7 +14,7 @@ from typing import Any
 import dummy_methods
 import numpy as np
 import pytest
-from changes import flip_bit, leave_part
+from changes import files_in, flip_bit, leave_part
 from dummy_methods import CountMethod, FailingMethod, WaitingMethod, WeightlessMethod, run, wait_for
 from nosy_methods import Refines
 from rich.console import Console
@@ -36,7 +36,7 @@ from spike4dgs.method.msdi.weights import WEIGHTS as MSDI
 from spike4dgs.studies.results import code_state as states
 from spike4dgs.studies.results.code_state import CodeState, check_clean, code_digest, code_state
 from spike4dgs.studies.results.command import Choice, results
-from spike4dgs.studies.results.plan import Cell, Group, Row, cells_of
+from spike4dgs.studies.results.plan import CEILING, Cell, Group, Row, cells_of
 from spike4dgs.studies.results.records import key_of, read_records, write_row
 from spike4dgs.studies.results.sweep import Outcome, SweepSettings, sweep
 
@@ -176,6 +176,24 @@ def test_a_quiet_pass_fits_again_what_was_measured_beside_others(folder: Path) -
     assert "0 to measure" in swept(folder, [planned], methods, quiet=True)[2]
     with pytest.raises(UserError, match="--quiet: expected one worker"):
         swept(folder, [planned], methods, quiet=True, workers=2)
+
+
+@pytest.mark.usefixtures("fits_here")
+@pytest.mark.parametrize(
+    "fails", [WeightlessMethod("counts"), FailingMethod("counts", ValueError("no luck"))], ids=["skipped", "failed"]
+)
+def test_a_quiet_pass_that_fails_keeps_what_was_measured_beside_others(fails: Method, folder: Path) -> None:
+    planned = cells("counts", CEILING)
+    _, busy, _ = swept(folder, planned, {"counts": CountMethod("counts")})
+    ceiling = next(r for r in busy.values() if r["row"] == CEILING)
+    write_row(folder / "records", CEILING, [ceiling | {"error": None, "metrics": {"psnr": 50.0}}])
+    before = files_in(folder / "records")
+    outcome, records, said = swept(folder, planned, {"counts": fails}, quiet=True)
+    assert files_in(folder / "records") == before and "1 to measure" in said, "a ceiling has no times"
+    (line,) = outcome.failed
+    assert line.startswith("counts on pattern-0, seed 0: ") and line.endswith("; its earlier record stays")
+    outcome, records, _ = swept(folder, planned, {"counts": CountMethod("counts")}, quiet=True)
+    assert not outcome.failed and next(r for r in records.values() if r["row"] == "counts")["quiet"]
 
 
 @pytest.mark.usefixtures("fits_here")
