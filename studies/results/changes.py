@@ -31,16 +31,27 @@ def kind_of(row: str) -> tuple[str, ...]:
     return "ours" if name in OURS else "theirs", *(part for part in parts if part in _LEARNED)
 
 
+def mark(row: MeasuredRow, other: MeasuredRow) -> str:
+    """Return `OTHER_CODE` where two rows were measured with different code, else nothing.
+
+    Digests of two kinds cannot be compared: then commits tell.
+    """
+    keys = ("code",) if kind_of(row.name) == kind_of(other.name) else ("code", "commit")
+    facts = [[{r[key] for r in each.cells.values()} for each in (row, other)] for key in keys]
+    return OTHER_CODE * all(one != two for one, two in facts)
+
+
 def change_text(row: MeasuredRow, other: MeasuredRow) -> str:
-    """Return `changes` as `both_text` has values, marked where one method's code differs; "-" where there are none."""
+    """Return `changes` as `both_text` has values, with the mark of other code; "-" where there are none."""
     found = changes(row, other)
-    same_row = row.name.removesuffix(REFINED) == other.name.removesuffix(REFINED)
-    mixed = same_row and {r["code"] for r in row.cells.values()} != {r["code"] for r in other.cells.values()}
-    return "-" if found is None else " / ".join(f"{change:+.2f}" for change in found) + OTHER_CODE * mixed
+    return "-" if found is None else " / ".join(f"{change:+.2f}" for change in found) + mark(row, other)
 
 
 def legend_of(text: str, lines: Iterable[Sequence[str]]) -> str:
     """Return the legend of a table, with a sentence on `OTHER_CODE` where a line has the mark."""
     marked = any(OTHER_CODE in cell for line in lines for cell in line)
-    note = f" {OTHER_CODE}: the two were measured with different code of the row, which is a part of the change."
+    note = (
+        f" {OTHER_CODE}: the two were measured with different code, or at different commits where digests cannot tell, "
+        "which may be a part of the change."
+    )
     return text + note * marked

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NOTHING, commits_text, of_group
+from spike4dgs.studies.results.changes import legend_of, mark
 from spike4dgs.studies.results.comparison import changes
 from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.conditions import CONDITIONS, GROUP, NONE, Condition, of_conditions, rows_under
@@ -44,7 +45,8 @@ def breaks_block(records: Sequence[Record]) -> list[str]:
         f'"no" where no measured amount does, "-" where nothing was measured. {_others(own, names)} '
         f"{commits_text(own)}."
     )
-    return [*markdown(("cause", "amounts", *(f"`{name}`" for name in names)), lines), "", legend]
+    text = legend_of(legend, [*lines, [legend]])
+    return [*markdown(("cause", "amounts", *(f"`{name}`" for name in names)), lines), "", text]
 
 
 def _sides() -> Iterator[tuple[str, dict[float, str]]]:
@@ -57,17 +59,20 @@ def _sides() -> Iterator[tuple[str, dict[float, str]]]:
 
 
 def _broken(name: str, side: Mapping[float, str], own: Sequence[Record]) -> str:
-    measured = {amount: change for amount, level in side.items() if (change := _changes(name, NAMED[level], own))}
+    """Return the mildest amounts, with the mark of other code where a measured change has it."""
+    measured = {amount: found for amount, level in side.items() if (found := _changes(name, NAMED[level], own))}
     if not measured:
         return "-"
-    broken = [[a for a, change in measured.items() if change[k] <= -BROKEN_DB] for k in (0, 1)]
-    return " / ".join(amount_text(amounts[0]) if amounts else "no" for amounts in broken)
+    broken = [[a for a, (change, _) in measured.items() if change[k] <= -BROKEN_DB] for k in (0, 1)]
+    texts = " / ".join(amount_text(amounts[0]) if amounts else "no" for amounts in broken)
+    return texts + max(marked for _, marked in measured.values())
 
 
-def _changes(name: str, condition: Condition, own: Sequence[Record]) -> list[float] | None:
-    """Return what a condition changes for a row, as `changes`; None where it was not measured."""
+def _changes(name: str, condition: Condition, own: Sequence[Record]) -> tuple[list[float], str] | None:
+    """Return what a condition changes for a row, as `changes`, and the mark; None where it was not measured."""
     row, without = (rows_under([name], c, own)[0] for c in (condition, condition.absent))
-    return changes(row, without)
+    found = changes(row, without)
+    return None if found is None else (found, mark(row, without))
 
 
 def _others(own: Sequence[Record], names: Sequence[str]) -> str:
@@ -76,7 +81,7 @@ def _others(own: Sequence[Record], names: Sequence[str]) -> str:
     broken = []
     for condition in CONDITIONS:
         if condition.name not in sized:
-            found = {name: _changes(name, condition, own) for name in names}
-            rows = [f"`{name}`" for name, change in found.items() if change and min(change) <= -BROKEN_DB]
+            measured = {name: found for name in names if (found := _changes(name, condition, own))}
+            rows = [f"`{name}`{marked}" for name, (change, marked) in measured.items() if min(change) <= -BROKEN_DB]
             broken += [f"{condition.name} ({', '.join(rows)})"] if rows else []
     return f"Of the other conditions, {'; '.join(broken) or 'none'} costs a row as much."

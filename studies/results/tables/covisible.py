@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NOTHING, metric_text, of_group, provenance
+from spike4dgs.studies.results.changes import legend_of, mark
 from spike4dgs.studies.results.comparison import MeasuredRow, rows_of
 from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables import conditions, realistic
@@ -28,6 +29,7 @@ def covisible_block(records: Sequence[Record]) -> list[str]:
     )
     shown = [record for record in (*own, *under) if METRICS[1] in record["metrics"]]
     groups = realistic.GROUP, *conditions.EVERY
+    legend = legend_of(legend, changes)
     return [*markdown(heads, [*track, *changes]), "", legend, "", provenance(shown, *groups)]
 
 
@@ -57,5 +59,6 @@ def _condition_lines(own: Sequence[Record]) -> list[list[str]]:
             found = [(row.mean(metric), without.mean(metric)) for metric in METRICS]
             known = [with_it - absent for with_it, absent in found if with_it is not None and absent is not None]
             if len(known) == len(METRICS):
-                lines.append([f"`{row.name}`, {condition.name}", *(f"{change:+.2f}" for change in known), "", ""])
+                texts = (f"{change:+.2f}{mark(row, without)}" for change in known)
+                lines.append([f"`{row.name}`, {condition.name}", *texts, "", ""])
     return lines

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, metric_text, of_group, provenance
-from spike4dgs.studies.results.changes import change_text
+from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
@@ -75,4 +75,4 @@ def parts_block(records: Sequence[Record]) -> list[str]:
     lines = [[*first, *texts] for first, *texts in zip(firsts, *columns, strict=True)]
     heads = ("switched off", "by", *(f"`{scene}`" for scene in GROUP.scenes), "mean")
     legend = f"`{WHOLE}`: whole image / where things move, dB. The first row lists PSNR, the others its change."
-    return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP)]
+    return [*markdown(heads, lines), "", legend_of(legend, lines), "", provenance(own, GROUP)]

@@ -10,7 +10,7 @@ from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import PublishedTable, published, ranks, tau_of
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, of_group, provenance
-from spike4dgs.studies.results.changes import change_text
+from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, differences, rows_of
 from spike4dgs.studies.results.plan import TABLE1, TABLE5, UNPOSED, Group, once
 from spike4dgs.studies.results.records import Record
@@ -88,7 +88,8 @@ def unposed_block(records: Sequence[Record]) -> list[str]:
         texts = both_text(row), f"{row.mean('ssim'):.4f}", f"`{partner.name}`", change_text(row, partner)
         lines.append([f"`{row.name}`", *texts])
     heads = ("row", "PSNR / moving", "SSIM", "given poses", "change of PSNR / moving, dB")
-    return [*markdown(heads, lines), "", provenance([*own, *others], UNPOSED, beside)]
+    legend = legend_of(f"Means of {len(UNPOSED.scenes)} scenes.", lines)
+    return [*markdown(heads, lines), "", legend, "", provenance([*own, *others], UNPOSED, beside)]
 
 
 def views_block(records: Sequence[Record]) -> list[str]:

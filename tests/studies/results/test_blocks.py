@@ -299,6 +299,24 @@ def test_estimated_poses_stand_beside_given_ones_where_both_are_measured():
     assert unposed_block(given)[-1].startswith("Commits c0ffee000000, decade000000;")
 
 
+@pytest.mark.parametrize(
+    ("given", "estimated", "changes", "marked"),
+    [
+        ("tfp+stg", "tfp+colmap+stg", {"commit": "decade000000"}, False),
+        ("tfp+stg", "tfp+colmap+stg", {"code": "00000000000c"}, True),
+        ("spike4dgs-x", "spike4dgs-x+colmap", {"code": "00000000000c"}, False),  # one covers the baselines
+        ("spike4dgs-x", "spike4dgs-x+colmap", {"code": "00000000000c", "commit": "decade000000"}, True),
+        ("spike4dgs", "spike4dgs-uncalibrated", {"code": "00000000000c"}, False),  # of other networks
+    ],
+)
+def test_other_code_of_the_row_with_given_poses_is_marked(
+    given: str, estimated: str, changes: dict[str, str], marked: bool
+) -> None:
+    found = [record(given, s, 30.0) for s in TABLE1.scenes]
+    line, _, legend, *_ = unposed_block([*found, *(record(estimated, s, 29.0, **changes) for s in TABLE1.scenes)])[2:]
+    assert line.endswith(f"| -1.00 / -1.00{'†' * marked} |") and ("different code" in legend) is marked
+
+
 def test_table_5_has_a_column_for_each_number_of_views():
     found = [record("spike4dgs", "turntable-0-small", 30.0 + n, split=f"views-{n}") for n in (3, 4, 8)]
     lines = views_block([*found, record("spike4dgs", "turntable-0-small", 50.0)])
@@ -339,6 +357,18 @@ def test_a_change_between_two_codes_of_a_row_is_marked() -> None:
     other = [record(OURS, s, 29.0, code="00000000000c") for s in lens]
     line, legend = (conditions_block([*before, *other])[k] for k in (3, 5))
     assert "| -1.00 / -1.00† |" in line and "†: the two were measured with different code" in legend
+
+
+def test_other_code_is_marked_in_the_tables_beside_conditions_too() -> None:
+    first, lens = (condition.scenes for condition in CONDITIONS[:2])
+    dim = next(c for c in CONDITIONS if c.name == "light 1/4").scenes
+    own = [record(OURS, s, 40.0) for s in (*first, *TRACK_SMALL.scenes)]
+    for code, mark in (("00000000000b", ""), ("00000000000c", "†")):
+        found = [*own, *(record(OURS, s, 35.0, code=code) for s in (*lens, *dim))]
+        broken, covisible = breaks_block(found), covisible_block(found)
+        assert any(f"| 1/4 / 1/4{mark} |" in line for line in broken) and f"lens, known (`{OURS}`{mark})" in broken[-1]
+        assert f"| `{OURS}`, lens, known | -5.00{mark} | -5.00{mark} |  |  |" in covisible
+        assert all(("†: the two were" in "".join(lines)) is bool(mark) for lines in (broken, covisible))
 
 
 def test_a_condition_that_was_made_in_one_world_is_compared_with_that_world():
@@ -542,6 +572,8 @@ def test_a_part_is_worth_what_its_absence_costs():
     assert coherence == (
         "| coherence of motion | `motion.coherence=0` | -0.50 / -0.50 | +0.50 / +0.50 | +1.50 / +1.50 | +0.50 / +0.50 |"
     )
+    other = [r | {"code": "00000000000c"} if r["row"] == off else r for r in found]
+    assert "| +0.50 / +0.50† |" in "".join(marked := parts_block(other)) and "different code" in marked[-3]
 
 
 def test_more_steps_stand_beside_a_rows_own():
