@@ -68,7 +68,7 @@ class MeasuredRow:
 
     def mean_cost(self, name: str) -> float | None:
         """Return the mean of a cost; None where a cell has none."""
-        found = [self.cells[scene, seed][name] for scene in self.scenes for seed in self.seeds]
+        found = [self.cells[scene, seed].get(name) for scene in self.scenes for seed in self.seeds]
         return None if None in found or not found else float(np.mean(found))
 
     @property
