@@ -67,16 +67,17 @@ def patterns(
     out: Path = Path("runs/patterns"),
     allow_gaps: bool = False,
 ) -> int:
-    """Fit `spike4dgs-x+self-calibrated` and write the gain and dark maps that it found: OUT/CAM.npz and .png.
+    """Fit `spike4dgs-x+self-calibrated` and write the gain and dark maps that it found: OUT/SCENE/CAM.npz, gain.png.
 
-    Where the scene has recordings of uniform light and of darkness, the table and OUT/errors.json list the errors.
+    Where the scene has recordings of uniform light and of darkness, the table and errors.json beside them list the
+    errors.
 
     Args:
         scene: Scene folder.
         budget: Steps of the fit: quick, standard, or a multiple of quick.
         seed: Seed of everything random.
         device: cpu, or a CUDA device.
-        out: Folder for the maps, their images and the errors.
+        out: Folder for a folder of each scene: the maps, their image and the errors.
         allow_gaps: Accept a recording with gaps.
     """
     training = open_scene(scene, allow_gaps).training
@@ -86,8 +87,8 @@ def patterns(
         model = method.fit(training_for(method, training), request)
     assert isinstance(model, FittedModel)
     gain, dark = (model.estimates[name].cpu().numpy().astype(np.float64) for name in ("gain", "dark"))
-    for old in (out / "errors.json", *out.glob("*.npz")):  # of another scene
-        old.unlink(missing_ok=True)
+    out = out / training.id
+    (out / "errors.json").unlink(missing_ok=True)  # of another fit
     for camera, g, d in zip(training.cameras, gain, dark, strict=True):
         with atomic_path(out / f"{camera.id}.npz") as part:
             np.savez(part, allow_pickle=False, gain=g.astype(np.float32), dark=d.astype(np.float32))

@@ -67,26 +67,27 @@ def with_recordings(scene: Path) -> TrainingScene:
 @pytest.mark.parametrize("recorded", [False, True])
 def test_command_writes_maps_and_their_errors(recorded, small_scene: Path, tmp_path, capsys, monkeypatch) -> None:
     scene = with_recordings(small_scene) if recorded else open_scene(small_scene).training
-    for old in ("errors.json", "cam_77.npz"):  # of another scene
-        (tmp_path / old).touch()
+    (out := tmp_path / scene.id).mkdir()
+    (out / "errors.json").touch()  # of another fit
+    (tmp_path / "mine.npz").touch()
     monkeypatch.setattr(pattern_report, "open_scene", lambda *_: SimpleNamespace(training=scene))
     assert main(["patterns", str(small_scene), "--budget", "0.01", "--out", str(tmp_path)]) == 0
     gain, dark = [], []
     for camera in scene.cameras:
-        with np.load(tmp_path / f"{camera.id}.npz") as maps:
+        with np.load(out / f"{camera.id}.npz") as maps:
             gain.append(maps["gain"].astype(np.float64))
             dark.append(maps["dark"].astype(np.float64))
     assert np.stack(gain).shape == (len(scene.cameras), scene.cameras[0].height, scene.cameras[0].width)
     assert np.stack(gain).mean(axis=(1, 2)) == pytest.approx(1, abs=1e-5)
-    assert (tmp_path / "gain.png").read_bytes()[:4] == b"\x89PNG"
-    assert (tmp_path / "errors.json").exists() == recorded and not (tmp_path / "cam_77.npz").exists()
+    assert (out / "gain.png").read_bytes()[:4] == b"\x89PNG"
+    assert (out / "errors.json").exists() == recorded and (tmp_path / "mine.npz").exists()
     if recorded:
-        rows = json.loads((tmp_path / "errors.json").read_text())
+        rows = json.loads((out / "errors.json").read_text())
         expected = pattern_errors(np.stack(gain), np.stack(dark), scene.calibrations)
         assert list(rows) == [camera.id for camera in scene.cameras]
         for row, right in zip(rows.values(), expected, strict=True):
             assert row == pytest.approx(right, rel=1e-4)
-    assert str(tmp_path) in capsys.readouterr().out.replace("\n", "")
+    assert str(out) in capsys.readouterr().out.replace("\n", "")
 
 
 def test_the_fit_gets_no_recordings(small_scene: Path) -> None:
