@@ -8,7 +8,7 @@ steps of four, which takes the same time, and what one stage gains another loses
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from spike4dgs.method.settings import Settings, SettingsByPart
@@ -135,7 +135,7 @@ KNOBS = (
     Knob("static_share", _has_static_share, _static_share, _steps, low=_SHARES[0], high=_SHARES[1]),
     _choice("last_rate", "trainer", "lr_last", 1.0, 0.3, 0.1),
     _choice("first_scale", "trainer", "initial_scale", 0.5, 0.7, 1.0),
-    _choice("views_per_step", "trainer", "views_per_step", 2, 4),
+    replace(_choice("views_per_step", "trainer", "views_per_step", 2, 4), has=_has_static_share),  # steps follow there
     _choice("average", "trainer", "average", 0.0, 0.2),
     _choice("time_cell", "motion", "cell_ticks", 16.0, 32.0, 64.0, 100.0),
     _choice("copies", "motion", "moving_copies", 2, 3, 5, 8),

@@ -21,6 +21,7 @@ from spike4dgs.method.images.training import make_training_images
 from spike4dgs.method.settings import override
 from spike4dgs.method.starts.base import StartRequest
 from spike4dgs.method.tuned import read_tuned, tuned
+from spike4dgs.studies.kit.blocks import table_rows
 from spike4dgs.studies.tuning.kept import keeping
 from spike4dgs.studies.tuning.knobs import STEPS_OF_TWO, as_settings, knobs_of, start_of
 from spike4dgs.studies.tuning.search import TRIALS, best_of, gain_of, publish, search, tuning, variant, write_results
@@ -42,6 +43,13 @@ def test_every_recipe_lies_in_the_space_of_its_search():
         for knob in knobs_of(getattr(method, "settings", {})):
             start = knob.start(method.settings)
             assert start in knob.choices if knob.choices else knob.low <= start <= knob.high, (name, knob.name)
+
+
+def test_views_of_a_step_change_only_where_the_number_of_steps_can_follow():
+    found = {name: {k.name for k in knobs_of(getattr(m, "settings", {}))} for name, m in find_methods().items()}
+    with_views = {name for name, knobs in found.items() if "views_per_step" in knobs}
+    assert "tfp+stg" in with_views and "tfp+static" not in with_views
+    assert all("static_share" in found[name] for name in with_views)
 
 
 @pytest.mark.parametrize("name", ["tfp+stg", "spike4dgs", "spike4dgs-x", "tfi+4dgs"])
@@ -137,16 +145,35 @@ def test_a_killed_search_goes_on_as_if_nothing_had_happened(whole, tmp_path):
         search(get_method("tfp+stg"), SCENES, path, {**ABOUT, "seed": 1}, 24, _fit, print)
 
 
-def test_the_best_settings_become_a_row(whole, tmp_path):
-    record, out = whole
+KEPT = "| `tfp+stg` | 1 | of another search |"
+
+
+@pytest.fixture
+def page(tmp_path):
+    """The page of searches, in a folder with what else of a checkout `publish` changes."""
     for folder in ("method", "baselines"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "tuned.json").write_text("{}")
     page = tmp_path / "docs" / "results" / "tuning.md"
     page.parent.mkdir(parents=True)
-    kept = "| `tfp+stg` | 1 | of another search |"
-    old = "\n".join(["| row |", "| --- |", "| `tfp+stg` | 0.25 | old |", kept])
+    old = "\n".join(["| row |", "| --- |", "| `tfp+stg` | 0.25 | old |", KEPT])
     page.write_text(f"before\n<!-- searches -->\n{old}\n<!-- end searches -->\nafter\n")
+    return page
+
+
+def test_a_search_of_fewer_trials_is_named_and_not_published(whole, page, tmp_path, capsys):
+    (out := tmp_path / "out").mkdir()
+    (out / "tfp+stg.json").write_text(json.dumps({**whole[0], "trials": whole[0]["trials"][:12]}))
+    write_results(out)
+    before = table_rows(page.read_text(), "searches")
+    publish(out, tmp_path)
+    assert capsys.readouterr().out == f"left out: tfp+stg, 12 of {TRIALS} trials\n"
+    assert table_rows(page.read_text(), "searches") == before and not list(page.parent.rglob("*.csv"))
+    assert read_tuned(tmp_path / "baselines" / "tuned.json") == {}
+
+
+def test_the_best_settings_become_a_row(whole, page, tmp_path):
+    record, out = whole
     write_results(out)
     publish(out, tmp_path)
     assert read_tuned(tmp_path / "method" / "tuned.json") == {}
@@ -156,7 +183,7 @@ def test_the_best_settings_become_a_row(whole, tmp_path):
     assert row.settings["trainer.lr_means"] == pytest.approx(1.6e-4 * best["knobs"]["rates"])
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
-    assert text.index("| `tfp+stg` | 0.25 |") < text.index(kept) and text.count("\n| ") == 4
+    assert text.index("| `tfp+stg` | 0.25 |") < text.index(KEPT) and text.count("\n| ") == 4
     assert (page.parent / "tables" / "tuning" / "tfp+stg@0.25.csv").read_text().count("\n") == TRIALS + 1
 
 
