@@ -123,9 +123,17 @@ def is_shown(record: Record, scene: Scene, folder: Path) -> bool:
 
 
 def write_results(path: Path, records: Sequence[Record]) -> None:
-    """Write a tidy CSV file: a row for each method, seed and scene, a column for each metric and cost."""
+    """Write a tidy CSV file: a row for each method, seed and scene, a column for each metric and cost.
+
+    Text that a spreadsheet would take for a formula gets an apostrophe: records may be of strangers.
+    """
     out = io.StringIO()
     writer = csv.DictWriter(out, SCENE_COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(row for record in records for row in scene_rows(record))
+    rows = (row for record in records for row in scene_rows(record))
+    writer.writerows({key: _no_formula(value) for key, value in row.items()} for row in rows)
     write_text(path, out.getvalue())
+
+
+def _no_formula(value: Any) -> Any:
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -11,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from changes import files_in
-from page_boards import board, cell, row
+from page_boards import board, cell, failed, row
 
 from spike4dgs.benchmark import files
 from spike4dgs.benchmark.errors import UserError
@@ -82,6 +83,14 @@ def test_a_folder_with_anything_else_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="an earlier page"):
         write_site(tmp_path, small())
     assert [p.name for p in tmp_path.rglob("*")] == ["data", "car", "scene.json"]
+
+
+def test_no_cell_is_a_formula_of_a_spreadsheet(tmp_path: Path) -> None:
+    device, error = "=HYPERLINK(1)", "-2+3"
+    cells = {"s": cell({"psnr": np.full(2, -1.5)}, device=device), "t": failed(error)}
+    write_site(tmp_path / "page", [board("b", [row("one", cells)])])
+    ok, lost = csv.DictReader((tmp_path / "page/data/cells-0.csv").read_text().splitlines())
+    assert (ok["device"], lost["error"], ok["psnr"]) == (f"'{device}", f"'{error}", "-1.5")
 
 
 def test_data_are_strings_of_a_script() -> None:
