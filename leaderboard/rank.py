@@ -5,8 +5,8 @@
     archive.json       entries of earlier releases, without ranks
 
 A row is a method: the mean over the seeds of those of its entries that may be ranked and have one configuration, which
-is equal code, parameters and verification. Those are re-scored or re-fitted, complete, and without flags, which follow
-from the entry and the release. Every other entry is a row of its own after them, without rank.
+is equal code, parameters and verification. Those are re-scored or re-fitted, complete, not refined, and without flags,
+which follow from the entry and the release. Every other entry is a row of its own after them, without rank.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -25,26 +25,24 @@ from spike4dgs.benchmark.method import DEFAULT_GIVEN
 from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import COSTS, Record, is_complete
+from spike4dgs.benchmark.runs.refinement import is_refined
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.entry import BOARD, CLAIMED, LABELS, Entry
 from spike4dgs.leaderboard.reading import Reading, read_briefs
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, on_release, place_of
+from spike4dgs.leaderboard.truth_check import truth_flags
 
 SCHEMA = "spike4dgs-leaderboard/2"
 FILES = {PUBLIC: BOARD, LOCAL: "local.json", ARCHIVE: "archive.json"}
-MAX_EQUAL_PIXELS = 0.25  # half floats of good renderings equal the truth's in a few percent of the pixels
-MAX_NOISE_SHARE = 0.1  # 0 for honest predictions; a tenth of the truth mixed in gives as much
-STANDARD_ERRORS = 5.0  # beyond chance: the noise has heavy tails, and honest fits of van reach three
 # Another rendering of the view with r times the truth's samples is 10 lg(1 + 1/r) dB below the noise ceiling: 3 dB with
 # as many, 4 with two thirds.
 RENDERED_DB = 4.0
-COPY, NOISE, CEILING, RENDERED, TRAINED = (
-    "equals truth",
-    "carries the truth's noise",
+CEILING, RENDERED, TRAINED = (
     "above the noise ceiling",
     "as near to the truth as another rendering",
     "trained on test scenes",
 )
+REFINED = "refined scores: the method is ranked by those at the calibrated pose"
 _BEFORE = "of an earlier release: these scenes' bytes are not those of the current one"
 
 
@@ -162,10 +160,10 @@ def rank_entries(entries: Mapping[str, Entry], ranked: bool = True, known: Known
 
 
 def is_verified(entry: Entry) -> bool:
-    """Return whether an entry is re-scored or re-fitted, and complete; without flags it may be ranked."""
+    """Return whether an entry is re-scored or re-fitted, complete and not refined; without flags it may be ranked."""
     record = entry["record"]
     checked = entry["verification"]
-    complete = is_complete(record) and record["mean"][PRIMARY] is not None
+    complete = is_complete(record) and record["mean"][PRIMARY] is not None and not is_refined(record["method"]["name"])
     return complete and checked["label"] != CLAIMED and PRIMARY not in checked["unverified"]
 
 
@@ -175,7 +173,7 @@ def flags_of(entry: Mapping[str, Any]) -> list[str]:
     release, found = current_release(), dict[str, list[str]]()
     revisions = on_release(record["dataset"])["scenes"]
     for scene, cell in sorted(record["scenes"].items()):
-        for flag in _of_truth(truth.get(scene)):
+        for flag in truth_flags(truth[scene]) if scene in truth else ():
             found.setdefault(flag, []).append(scene)
         revision, psnr = revisions[scene], cell["metrics"]["psnr"]
         ceiling = release.ceiling_db(scene, revision) or truth.get(scene, {}).get("ceiling_db")
@@ -185,16 +183,6 @@ def flags_of(entry: Mapping[str, Any]) -> list[str]:
         if any(_names(text, name) for text in record["method"]["trained_on"] for name in (scene, revision)):
             found.setdefault(TRAINED, []).append(scene)
     return [f"{flag} ({', '.join(scenes)})" for flag, scenes in found.items()]
-
-
-def _of_truth(check: Mapping[str, Any] | None) -> Iterator[str]:
-    if check is None:
-        return
-    if check["equal_images"] or check["equal_pixels"] > MAX_EQUAL_PIXELS:
-        yield COPY
-    share, error = check["noise_share"], check["noise_share_error"]
-    if share is not None and share - STANDARD_ERRORS * error > MAX_NOISE_SHARE:
-        yield NOISE
 
 
 def _names(text: str, name: str) -> bool:
@@ -288,7 +276,9 @@ def reason(row: Mapping[str, Any]) -> str:
         return "; ".join(row["flags"])
     if missing := [f"{scene} {status}" for scene, status in row["status"].items() if status != "ok"]:
         return ", ".join(missing)
-    return "nothing was computed again" if row["label"] == CLAIMED else f"no {PRIMARY}"
+    if row["label"] == CLAIMED:
+        return "nothing was computed again"
+    return REFINED if is_refined(row["method"]) else f"no {PRIMARY}"
 
 
 def board_name(board: Mapping[str, Any], folder: str, release: str) -> str:

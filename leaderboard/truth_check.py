@@ -14,7 +14,7 @@ Neither tells a denoised truth from a good method: fitting again does.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,10 @@ from spike4dgs.benchmark.scene.scene import Scene, Target
 
 Renderings = tuple[Target, Float32, Float32]
 SecondRenderings = Callable[[Scene], Renderings | None]
+MAX_EQUAL_PIXELS = 0.25  # half floats of good renderings equal the truth's in a few percent of the pixels
+MAX_NOISE_SHARE = 0.1  # 0 for honest predictions; a tenth of the truth mixed in gives as much
+STANDARD_ERRORS = 5.0  # beyond chance: the noise has heavy tails, and honest fits of van reach three
+COPY, NOISE = "equals truth", "carries the truth's noise"
 _WINDOW = 3  # px of the high-pass: texture that predictions blur is left out, Monte Carlo noise is white
 
 
@@ -35,8 +39,8 @@ class TruthCheck:
     """The predictions of a scene beside its truth; without second renderings the last three are None."""
 
     images: int
-    equal_images: int  # equal to the truth in every bit
-    equal_pixels: float  # share, without black and white pixels, which may well agree
+    equal_images: int  # with more than `MAX_EQUAL_PIXELS` equal ones
+    equal_pixels: float  # share of all images; without black and white pixels, which may well agree
     noise_share: float | None = None
     noise_share_error: float | None = None  # standard error
     ceiling_db: float | None = None
@@ -52,9 +56,9 @@ def check_truth(predictions: Predictions, scene: Scene, second_renderings: Secon
     for target in scene.targets:
         truth, image = scene.ground_truth(target), predictions.read(target)
         gray = (truth > 0) & (truth < 1)
-        same = (truth == image) & gray
-        equal, compared = equal + int(same.sum()), compared + int(gray.sum())
-        equal_images += bool(gray.any() and np.array_equal(truth, image))
+        same, of = int(((truth == image) & gray).sum()), int(gray.sum())
+        equal, compared = equal + same, compared + of
+        equal_images += same > MAX_EQUAL_PIXELS * of
     found = TruthCheck(len(scene.targets), equal_images, equal / max(compared, 1))
     if (renderings := second_renderings(scene)) is None:
         return found
@@ -63,6 +67,15 @@ def check_truth(predictions: Predictions, scene: Scene, second_renderings: Secon
     share, error = noise_share(image, truth, first, second)
     noise = noise_ceiling_db(truth, first, second)
     return TruthCheck(found.images, equal_images, found.equal_pixels, share, error, noise)
+
+
+def truth_flags(check: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the flags that follow from what an entry states of a scene's `TruthCheck`."""
+    if check["equal_images"] or check["equal_pixels"] > MAX_EQUAL_PIXELS:
+        yield COPY
+    share, error = check["noise_share"], check["noise_share_error"]
+    if share is not None and share - STANDARD_ERRORS * error > MAX_NOISE_SHARE:
+        yield NOISE
 
 
 def noise_ceiling_db(truth: NDArray[Any], first: NDArray[Any], second: NDArray[Any]) -> float | None:

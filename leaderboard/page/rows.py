@@ -10,9 +10,10 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
+from spike4dgs.benchmark.runs.refinement import is_refined
 from spike4dgs.benchmark.runs.results import record_paths
 from spike4dgs.leaderboard.entry import Entry
-from spike4dgs.leaderboard.rank import make_boards, reason
+from spike4dgs.leaderboard.rank import REFINED, make_boards, reason
 from spike4dgs.leaderboard.reading import Reading, read_briefs, read_checked
 from spike4dgs.leaderboard.thumbnails import KEY, sheet_path
 from spike4dgs.leaderboard.tracks import (
@@ -180,9 +181,10 @@ def _add_run(board: Board, run: Path, records: Sequence[Record]) -> None:
     row = next((r for r in board.rows if _images(first) in map(_images, r.records)), None)
     if row is None:
         name = f"{run.name}/{first['method']['name']}"
-        complete = all(map(is_complete, records))
+        complete, refined = all(map(is_complete, records)), is_refined(first["method"]["name"])
         missing = ", ".join(f"{s} {c['status']}" for s, c in first["scenes"].items() if c["status"] != "ok")
-        row = Row(name, OWN, complete, missing, tuple(records), run=run)
+        why = missing or (REFINED if refined else "")
+        row = Row(name, OWN, complete and not refined, why, tuple(records), run=run)
         board.rows.append(row)
     row.predictions.update(_folders(run, first))
 

@@ -28,6 +28,10 @@ from spike4dgs.leaderboard.reading import read_entries
         (lambda e: e["verification"].update(label="re-fitted"), "at verification"),
         (lambda e: e.update(note="x"), "'note' was unexpected"),
         (lambda e: e["record"].update(note="x"), "at record"),
+        (
+            lambda e: e["verification"]["truth"]["pattern-0"].update(noise_share=0.5),
+            "at verification/truth/pattern-0/noise_share_error",
+        ),
         (lambda e: e["record"]["method"].update(name="other"), "found that of local/pattern-0+1@"),
         (lambda e: e["record"]["dataset"]["scenes"].update({"pattern-0": "0" * 64}), "found that of local/"),
         (lambda e: e["record"]["mean"].update(psnr=50.0), "expected psnr ="),

@@ -20,7 +20,7 @@ from spike4dgs.benchmark.runs.predictions import INFO, SUMS
 from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.cli.score import score
-from spike4dgs.leaderboard.rank import flags_of, rank_entries, write_boards
+from spike4dgs.leaderboard.rank import REFINED, flags_of, rank_entries, reason, write_boards
 
 
 def test_rows_are_ranked_and_failures_come_last(done: Path) -> None:
@@ -97,6 +97,17 @@ def test_a_row_is_the_mean_over_the_seeds_of_one_configuration(finished: Path) -
         ("a", 2, [0, 1, 2], 21.0),
         ("a", None, [4], 90.0),
     ]
+
+
+def test_refined_scores_have_no_rank_and_say_so(done: Path) -> None:
+    record = json.loads((done / "out/results/rough.json").read_text())
+    names = {"rough.refined": 30.0, "rough": 20.0}
+    entries = {
+        f"entries/a@0/{n}.json": entry_with(record, n, psnr, "2026-01-01T00:00:00Z") for n, psnr in names.items()
+    }
+    first, refined = rank_entries(entries)
+    assert (first["method"], first["rank"]) == ("rough", 1)
+    assert (refined["method"], refined["rank"], reason(refined)) == ("rough.refined", None, REFINED)
 
 
 def test_seeds_join_only_with_equal_code_parameters_and_verification(finished: Path) -> None:

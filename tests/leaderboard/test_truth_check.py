@@ -117,20 +117,23 @@ def test_the_truth_is_flagged_and_honest_methods_are_not(
     predict(done, "copied", truth)
     predict(done, "disturbed", lambda s, t: truth(s, t) + rng.normal(0, 0.003, truth(s, t).shape))
     predict(done, "one", lambda s, t: truth(s, t) + 0.05 * (t.tick != 40))
+    some = np.arange(24 * 40).reshape(24, 40) % 2
+    predict(done, "half", lambda s, t: truth(s, t) + 0.05 * ((t.tick != 40) | some))
     predict(done, "pixels", lambda s, t: np.where(rng.random((24, 40)) < 0.3, truth(s, t), 0.7))
     for name in ("tfp+4dgs", "rough"):
         row = enter_checked(done, name)
         assert row["flags"] == [] and row["rank"] is not None
     scenes = "(pattern-0, pattern-1)"
     assert f"equals truth {scenes}" in enter_checked(done, "copied")["flags"]
-    assert enter_checked(done, "one")["flags"][0] == f"equals truth {scenes}"
+    for name in ("one", "half"):  # of an image
+        assert enter_checked(done, name)["flags"][0] == f"equals truth {scenes}"
     assert enter_checked(done, "pixels")["flags"] == [f"equals truth {scenes}"]
     row = enter_checked(done, "disturbed")
     assert row["rank"] is None and f"carries the truth's noise {scenes}" in row["flags"]
     assert (
         "disturbed: re-scored, not ranked (carries the truth's noise (pattern-0, pattern-1)" in capsys.readouterr().out
     )
-    assert [r["rank"] for r in board(done, "leaderboard")["boards"][0]["rows"]] == [1, 2, None, None, None, None]
+    assert [r["rank"] for r in board(done, "leaderboard")["boards"][0]["rows"]] == [1, 2, *[None] * 5]
     entry = read(next((done / "board/entries").glob("*/disturbed.json")))
     for check in entry["verification"]["truth"].values():
         assert check["noise_share"] == pytest.approx(1, abs=0.1)

@@ -11,6 +11,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.runs.record import of_scenes, read_record
 from spike4dgs.leaderboard.page.rows import OWN, Board, find_board, gather, titles
+from spike4dgs.leaderboard.rank import REFINED
 from spike4dgs.leaderboard.tracks import ARCHIVE, PUBLIC
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
@@ -54,6 +55,16 @@ def test_seeds_of_fewer_scenes_are_a_board_of_their_own(done: Path) -> None:
     boards = [b for b in gather(done / "none", (done / "out",))[0] if b.rows]
     assert sorted(b.scenes for b in boards) == [["pattern-0", "pattern-1"], ["pattern-1"]]
     assert [len(r.records) for b in boards for r in b.rows if r.name == "out/tfp+4dgs"] == [1, 1]
+
+
+def test_refined_scores_of_a_run_have_no_rank(done: Path) -> None:
+    record = read_record(done / "out/results/rough.json")
+    write_json(
+        done / "out/results/rough.refined.json", {**record, "method": {**record["method"], "name": "rough.refined"}}
+    )
+    (board,) = [b for b in gather(done / "none", (done / "out",))[0] if b.rows]
+    found = {r.name: (r.ranked, r.why) for r in board.rows}
+    assert (found["out/rough"], found["out/rough.refined"]) == ((True, ""), (False, REFINED))
 
 
 def test_a_folder_without_records_is_refused(tmp_path: Path) -> None:
