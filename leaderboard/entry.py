@@ -59,7 +59,7 @@ def check_folder(leaderboard: Path) -> None:
     """Raise UserError unless a folder is a leaderboard, or new, or empty; an empty path is the working folder."""
     # Listed once: another submitter may be making the leaderboard, and writes the ledger first.
     names = {path.name for path in leaderboard.iterdir()} if leaderboard.is_dir() else set()
-    if names & {*FOLDERS, BOARD, LEDGER}:
+    if names & {BOARD, LEDGER}:
         return
     empty = all(name.startswith(".") for name in names) and (leaderboard.is_dir() or not leaderboard.exists())
     if leaderboard == Path() or not empty:
@@ -256,15 +256,16 @@ def lock(leaderboard: Path) -> Any:
 
 
 def remove_parts(leaderboard: Path) -> None:
-    """Remove what killed processes left half written, and sheets without an entry.
+    """Remove what killed processes left half written, and sheets without their entry, which the ledger lists.
 
     The caller holds the leaderboard's lock.
     """
     for pattern in (".*.part*", *(f"{folder}/*/.*.part*" for folder in FOLDERS)):
         for part in leaderboard.glob(pattern):
             part.unlink(missing_ok=True)
+    listed = {leaderboard / path for _, path in read_ledger(leaderboard)}
     for sheet in sheets(leaderboard, *FOLDERS):
-        if not sheet.with_suffix(".json").is_file():
+        if (entry := sheet.with_suffix(".json")) in listed and not entry.is_file():
             sheet.unlink(missing_ok=True)
 
 

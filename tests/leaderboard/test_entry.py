@@ -13,11 +13,12 @@ from changes import edit_json, files_in
 from submissions import board, edit_with_ledger, enter, entry_of, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import locked
+from spike4dgs.benchmark.files import locked, write_bytes
 from spike4dgs.leaderboard import entry
-from spike4dgs.leaderboard.entry import check_numbers, entry_path, write_entry
+from spike4dgs.leaderboard.entry import check_numbers, entry_path, remove_parts, write_entry
 from spike4dgs.leaderboard.rank import write_boards
 from spike4dgs.leaderboard.reading import read_entries
+from spike4dgs.leaderboard.thumbnails import sheet_path
 
 
 @pytest.mark.parametrize(
@@ -73,6 +74,14 @@ def test_half_written_files_of_killed_processes_block_nobody(entered: Path) -> N
     enter(entered, "rough")
     assert len(board(entered)["boards"][0]["rows"]) == 2 and not board(entered)["refused"]
     assert not [name for name in files_in(entered / "board") if ".part" in name]
+
+
+def test_sheets_without_an_entry_go_if_the_ledger_knows_them(entered: Path) -> None:
+    path, photo = entry_of(entered), entered / "board/archive/2024/photo.webp"
+    path.unlink()
+    write_bytes(photo, b"theirs")
+    remove_parts(entered / "board")
+    assert photo.is_file() and not sheet_path(path).exists()
 
 
 @pytest.mark.parametrize("name", ["../../evil", "a/b", "..", ".hidden", "", "a\n", "CON", "aux.v2", "name.", "x" * 101])

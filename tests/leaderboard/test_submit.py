@@ -13,7 +13,7 @@ from nosy_methods import Darker, PlaysBack
 from submissions import board, enter, entry_of, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import sha256_json
+from spike4dgs.benchmark.files import sha256_json, write_bytes
 from spike4dgs.cli.submit import submit_all
 
 
@@ -124,9 +124,11 @@ def test_a_refused_record_does_not_stop_the_others(done: Path, capsys: pytest.Ca
 
 
 def test_a_folder_that_is_no_leaderboard_is_refused(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("site/index.html", "site/archive/2024/photo.webp"):
+        write_bytes(done / name, b"theirs")
     before = files_in(done)
     monkeypatch.chdir(done)
-    for name in ("", ".", "out", "s0/scene.json"):
+    for name in ("", ".", "out", "s0/scene.json", "site"):
         with pytest.raises(UserError, match="--leaderboard: expected a leaderboard or a new folder"):
             submit(done / "out/results/rough.json", leaderboard=Path(name))
         with pytest.raises(UserError, match="--leaderboard"):
