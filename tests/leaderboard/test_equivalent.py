@@ -14,6 +14,7 @@ from submissions import board, edit_with_ledger, enter, raise_metric, read, trac
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.release.fingerprint import make_fingerprint, write_fingerprint
+from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard import tracks
@@ -24,14 +25,21 @@ SCENES = ("s0", "s1")
 
 
 def ship(done: Path, monkeypatch: pytest.MonkeyPatch, share: float) -> Path:
-    """Ship a release of the run's scenes, with `share` of the spike bits of the training views of s0 changed."""
+    """Ship a release of the run's scenes, with `share` of the spike bits of the training views of s0 changed, and
+    with other last bits in half of its truth."""
     data = done / "released"
     for name in SCENES:
         shutil.copytree(done / name, data / name)
+    scene = open_scene(data / "s0")
     for path in sorted((data / "s0/spikes").glob("cam_0[0-2].dat")):
         bits = np.unpackbits(np.fromfile(path, np.uint8))
         bits ^= np.random.default_rng(0).random(bits.shape) < share
         np.packbits(bits).tofile(path)
+    for target in scene.targets:
+        bits = scene.ground_truth(target).astype(np.float16).view(np.uint16)
+        bits[::2] ^= 1
+        image = bits.view(np.float16).astype(np.float32)
+        write_exr(data / f"s0/images/{target.name}.exr", image, scene.t_us(target.tick))
     write_manifest(data / "s0")
     scenes = [open_scene(data / name) for name in SCENES]
     folder = write_release(done / "releases", {"patterns": track({s.id: s.revision for s in scenes})})
