@@ -232,7 +232,7 @@ def _enter(verified: Sequence[Verified], leaderboard: Path, replace: bool, refus
         v = entry["verification"]
         why = f" ({one.missing})" if one.missing and v["label"] == CLAIMED else ""
         if v["label"] != CLAIMED and v["unverified"]:
-            why = f" (as claimed, for lack of weights: {', '.join(v['unverified'])})"
+            why = f" (as claimed, not computed again: {', '.join(v['unverified'])})"
         at = standing(boards, entry_path(one.record))
         found.standings.append(f"{one.record['method']['name']}: {v['label']}{why}, {at}")
     places = [place_of(one.record) for one, _ in entered]

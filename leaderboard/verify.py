@@ -3,7 +3,7 @@
 The predictions of a record are hashed and scored again, and every value is compared with the record's.
 
 Fit time, speed and memory cannot be computed again: they must equal those in prediction.json. Metrics whose weights
-this machine lacks are not compared. The predictions are compared with the truth and its noise (`truth_check`).
+or files are not here are not compared. The predictions are compared with the truth and its noise (`truth_check`).
 """
 
 from __future__ import annotations
@@ -241,8 +241,10 @@ def _score_again(
     rescored = verify_record(record, where, predictions / record["method"]["name"], scenes, second_renderings)
     if stated["label"] == CLAIMED:
         return
-    if hidden := sorted(m for m in stated["unverified"] if METRICS[m].weights is None):
-        raise problem(where, "no unverified metric that needs no weights", ", ".join(hidden), _EDITED)
+    hidden = {m for m in stated["unverified"] if METRICS[m].weights is None} - rescored.unverified
+    if hidden:
+        fix = "submit the record again with --replace"
+        raise problem(where, "no unverified metric that these files give", ", ".join(sorted(hidden)), fix)
     before = "carried_over" in stated and not stated["truth"]  # the check is younger than the entry
     if not before and (extra := sorted(rescored.truth.keys() ^ stated["truth"].keys())):
         fix = "submit the record again with --replace"

@@ -41,7 +41,7 @@ def image_scores(board: Board, metric: str) -> ImageScores:
     no part in any mean.
     """
     left_out = {i: row.why or "not ranked" for i, row in enumerate(board.rows) if not row.ranked}
-    claimed = f"{METRICS[metric].title} as claimed: the verifier lacked its weights"
+    claimed = f"{METRICS[metric].title} as claimed: nobody computed it again"
     left_out |= {i: claimed for i, row in enumerate(board.rows) if row.ranked and metric in row.unverified}
     scored = {i: _scored(row, board.scenes, metric) for i, row in enumerate(board.rows) if i not in left_out}
     union = [sorted(set().union(*(names[s] for names in scored.values()))) for s in range(len(board.scenes))]

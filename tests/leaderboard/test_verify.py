@@ -135,7 +135,7 @@ def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
     entry = read(enter(done, "with"))
     assert (entry["verification"]["label"], entry["verification"]["unverified"]) == ("re-scored", ["metaiqa"])
     assert entry["record"]["mean"]["metaiqa"] > 0 and board(done)["boards"][0]["rows"][0]["unverified"] == ["metaiqa"]
-    assert "with: re-scored (as claimed, for lack of weights: metaiqa), rank 1" in capsys.readouterr().out
+    assert "with: re-scored (as claimed, not computed again: metaiqa), rank 1" in capsys.readouterr().out
     monkeypatch.setenv(VARIABLE, str(weights))
     path = enter(done, "with")
     assert read(path)["verification"]["unverified"] == []
@@ -269,7 +269,7 @@ def edit_truth(**changes: Any) -> Any:
     ("change", "message"),
     [
         (edit_truth(equal_pixels=0.0), r"scene pattern-0: expected equal_pixels 0\.\d+, as computed again, found 0\.0"),
-        (lambda e: e["verification"].update(unverified=["psnr"]), "no unverified metric that needs no weights"),
+        (lambda e: e["verification"].update(unverified=["psnr"]), "no unverified metric that these files give"),
         (edit_truth(equal_images=1), "expected equal_images 0, as computed again, found 1"),
         (lambda e: e["verification"]["truth"].pop("pattern-1"), "expected a check beside the truth of each scored"),
         (
@@ -301,6 +301,22 @@ def test_an_edited_verification_is_found_with_the_files(
 
 REFIT = {"psnr": {"pattern-0": 20.0}, "tolerance_db": 0.3, "bit_equal": False, "costs": {}, "apart": "process"}
 SCENES = ("pattern-0", "pattern-1")
+
+
+def test_a_metric_whose_files_were_missing_is_no_edit(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As scenes come that were downloaded without their held-out streams."""
+    streams = [(done / name / "spikes/cam_03.dat", done / f"{name}.dat") for name in ("s0", "s1")]
+    for stream, away in streams:
+        stream.rename(away)
+    enter(done)
+    assert "(as claimed, not computed again: spike_psnr_5, " in capsys.readouterr().out
+    assert not problems(done, capsys, **files(done))
+    for stream, away in streams:
+        away.rename(stream)
+    (line,) = problems(done, capsys, **files(done))
+    assert "expected no unverified metric that these files give, found spike_deviance, " in line
+    enter(done)
+    assert not problems(done, capsys, **files(done))
 
 
 def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,7 +72,7 @@ def test_a_metric_that_nobody_computed_again_gives_no_rank() -> None:
     false = replace(false, entries={"local/s@0/false.json": refit})
     scores = image_scores(board("b", [honest, false]), "lpips_vgg")
     assert list(scores.values) == [0]
-    assert scores.left_out == {1: f"{METRICS['lpips_vgg'].title} as claimed: the verifier lacked its weights"}
+    assert scores.left_out == {1: f"{METRICS['lpips_vgg'].title} as claimed: nobody computed it again"}
     assert list(image_scores(board("b", [honest, false]), "psnr").values) == [0, 1]
     content = board_content(board("b", [honest, false]), "b")
     assert [r["unverified"] for r in content["rows"]] == [[], ["lpips_vgg"]]

@@ -241,7 +241,7 @@ def test_a_claimed_value_is_not_first_and_says_so(page: Page) -> None:
     cells = "[...document.querySelectorAll('#table tbody tr')]"
     assert page.value(f"{cells}.map(r => r.cells[2].classList.contains('best'))") == [True, False]
     notes = page.value(f"{cells}.map(r => r.querySelector('th').textContent)")
-    assert "as claimed, for lack of weights: LPIPS" in notes[1] and "as claimed" not in notes[0]
+    assert "as claimed, not computed again: LPIPS" in notes[1] and "as claimed" not in notes[0]
 
 
 def better_of(page: Page, name: str, scenes: list[int]) -> Any:

@@ -94,7 +94,7 @@ Spike4DGS.table = (() => {
       lines.push(`incomplete: ${which.join("; ")}`);
     } else if (!item.row.ranked && item.row.why) lines.push(`not ranked: ${item.row.why}`);
     const claimed = view.columns.filter((c) => isClaimed(item, c) && item.row.label !== "claimed");
-    if (claimed.length) lines.push(`as claimed, for lack of weights: ${claimed.map((c) => c.title).join(", ")}`);
+    if (claimed.length) lines.push(`as claimed, not computed again: ${claimed.map((c) => c.title).join(", ")}`);
     if (item.row.seeds.length > 1) lines.push(`${item.row.seeds.length} seeds`);
     return lines.map((text) => el("div", { class: "note" }, text));
   }
