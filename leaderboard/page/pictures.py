@@ -21,6 +21,7 @@ from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.leaderboard.page.rows import Board
 from spike4dgs.leaderboard.thumbnails import SUFFIX, read_sheet, sheet_size, top_of, webp
+from spike4dgs.leaderboard.tracks import match_release
 
 FOLDER = "pictures"
 
@@ -48,13 +49,19 @@ def _of_run(
         return None
     try:
         scene = open_scene(data / name, allow_gaps=True, split=board.dataset["split"])
-        if (revision := board.dataset["scenes"][name]) != scene.revision:
+        if (revision := board.dataset["scenes"][name]) != scene.revision and revision != _released(scene):
             say(f"no images of {name}: {data / name} has another revision than {revision[:12]}")
         elif has_truth(scene):
             return _write_scene(out, below, scene, board, folders, written, say)
     except UserError as e:
         say(f"no images of {name}: {e}")
     return None
+
+
+def _released(scene: Scene) -> str | None:
+    """Return the release's revision that a scene is equivalent to; None where there is none."""
+    match = match_release(scene)
+    return match.revision if match and match.is_equivalent else None
 
 
 def _write_sheets(out: Path, board: Board, written: set[Path], say: Callable[[str], None]) -> dict[int, str]:
@@ -110,7 +117,7 @@ def _write_scene(
     folders: dict[int, Path],
     written: set[Path],
     say: Callable[[str], None],
-) -> dict[str, Any]:
+) -> dict[str, Any] | None:
     truths = [scene.ground_truth(t) for t in scene.targets]
     boxes = crops([scene.moving(t) for t in scene.targets])
     scales = dict[int, float]()
@@ -140,6 +147,8 @@ def _write_scene(
             rows.append(i)
         except UserError as e:
             say(f"no images of {board.rows[i].name} on {scene.id}: {e}")
+    if not rows:
+        return None
     height, width = truths[0].shape
     return {
         "folder": below,

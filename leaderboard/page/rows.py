@@ -29,6 +29,7 @@ from spike4dgs.leaderboard.tracks import (
 )
 
 _NAMED = 4  # scenes that a board's title names
+ENTERED = "leaderboard"  # of a run: where `run-benchmark` enters its records
 OWN = "own run"  # the label of a reader's records, beside those of entries
 
 
@@ -109,12 +110,23 @@ def gather(
     if published and leaderboard.resolve() != SHIPPED.resolve():
         _add_published(boards, brief)
     for run in runs:
-        for of_method in seeds_of_methods(run_records(run)):
+        entered = [r for board in boards for row in board.rows for r in row.records]
+        entered += [entry["record"] for entry in read_checked(run / ENTERED).entries.values()]
+        for of_method in seeds_of_methods([_as_entered(record, entered) for record in run_records(run)]):
             for records in _by_dataset(of_method):
                 for board in _boards_of(boards, records[0]):
                     _add_run(board, run, records)
     order = (PUBLIC, LOCAL, ARCHIVE)
     return sorted(boards, key=lambda b: order.index(b.folder)), refused
+
+
+def _as_entered(record: Record, entered: Sequence[Record]) -> Record:
+    """Return a run's record with the equivalent scenes that its entry names: a run does not compare its scenes."""
+    for other in (r for r in entered if "equivalent" in r["dataset"]):
+        without = {key: value for key, value in other["dataset"].items() if key != "equivalent"}
+        if without == record["dataset"] and _images(other) == _images(record):
+            return {**record, "dataset": other["dataset"]}
+    return record
 
 
 def _by_dataset(records: Sequence[Record]) -> list[list[Record]]:
@@ -178,15 +190,16 @@ def _boards_of(boards: list[Board], record: Record) -> Iterator[Board]:
 
 def _add_run(board: Board, run: Path, records: Sequence[Record]) -> None:
     first = records[0]
-    row = next((r for r in board.rows if _images(first) in map(_images, r.records)), None)
-    if row is None:
+    images = {_images(record): record for record in records}
+    if not any(images.keys() <= set(map(_images, row.records)) for row in board.rows):
         name = f"{run.name}/{first['method']['name']}"
         complete, refined = all(map(is_complete, records)), is_refined(first["method"]["name"])
         missing = ", ".join(f"{s} {c['status']}" for s, c in first["scenes"].items() if c["status"] != "ok")
         why = missing or (REFINED if refined else "")
-        row = Row(name, OWN, complete and not refined, why, tuple(records), run=run)
-        board.rows.append(row)
-    row.predictions.update(_folders(run, first))
+        board.rows.append(Row(name, OWN, complete and not refined, why, tuple(records), run=run))
+    for row in board.rows:
+        if record := images.get(_images(row.first)):
+            row.predictions.update(_folders(run, record))
 
 
 def _images(record: Record) -> tuple[Any, ...]:

@@ -18,6 +18,8 @@ from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.leaderboard import tracks
+from spike4dgs.leaderboard.page.pictures import write_pictures
+from spike4dgs.leaderboard.page.rows import gather
 from spike4dgs.leaderboard.tracks import RELEASE, current_release, match_release, release_line, scene_name
 from spike4dgs.leaderboard.verify import verify_leaderboard
 
@@ -85,6 +87,24 @@ def test_it_is_scored_again_on_its_own_scenes_and_on_the_releases(
     edit_with_ledger(path, lambda entry: raise_metric(entry["record"], "psnr", 0.5))
     found = verify_leaderboard(done / "board", done / "out/predictions", scenes)
     assert any("mean" in problem or "psnr" in problem for problem in found.problems)
+
+
+def test_the_run_stands_on_the_track_with_its_images(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the entry is on the page's leaderboard, and where `run-benchmark` alone made it."""
+    ship(done, monkeypatch, 1e-4)
+    for name in ("bad", "rough"):
+        (done / f"out/results/{name}.json").unlink()
+    enter(done)
+    shutil.copytree(done / "board", done / "out/leaderboard")
+    for leaderboard, method in (("board", "tfp+4dgs"), ("none", "out/tfp+4dgs")):
+        (found,) = gather(done / leaderboard, (done / "out",))[0]
+        (row,) = found.rows
+        assert (found.name, row.name, set(row.predictions)) == ("patterns", method, set(found.scenes))
+    for name in SCENES:
+        (done / name).rename(done / open_scene(done / name).id)
+    said = list[str]()
+    pictures = write_pictures(done / "page", found, 0, done, set(), said.append)
+    assert [of["rows"] for of in pictures] == [[0], [0]] and not said
 
 
 def test_another_noise_is_on_a_local_board(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:

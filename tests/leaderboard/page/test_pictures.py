@@ -66,6 +66,16 @@ def test_what_cannot_be_shown_is_said(finished: Path, data: Path, tmp_path: Path
     assert any("no images of pattern-1" in line for line in said)
 
 
+def test_a_scene_whose_images_are_all_others_shows_thumbnails(done: Path, data: Path, tmp_path: Path) -> None:
+    enter(done)
+    for name in ("tfp+4dgs", "rough"):
+        (done / f"out/predictions/{name}/pattern-0/SHA256SUMS").unlink()
+    (board,) = gather(done / "board", (done / "out",))[0]
+    said = list[str]()
+    first, second = write_pictures(tmp_path, board, 0, data, set(), said.append)
+    assert "sheets" in first and "folder" in second and len(said) == 2
+
+
 def shown(done: Path, out: Path) -> tuple[Board, list[Any], list[str]]:
     """The page's board of the entries alone, its pictures, and what is not shown."""
     (board,) = gather(done / "board", ())[0]

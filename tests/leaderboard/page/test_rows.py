@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from submissions import enter, release_of
+from dummy_methods import CountMethod, run
+from submissions import enter, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
@@ -65,6 +66,21 @@ def test_refined_scores_of_a_run_have_no_rank(done: Path) -> None:
     (board,) = [b for b in gather(done / "none", (done / "out",))[0] if b.rows]
     found = {r.name: (r.ranked, r.why) for r in board.rows}
     assert (found["out/rough"], found["out/rough.refined"]) == ((True, ""), (False, REFINED))
+
+
+def test_a_run_of_other_seeds_than_an_entry_is_a_row_or_lends_no_images(done: Path) -> None:
+    scenes = (done / "s0", done / "s1")
+    run(done / "out/seed-1", [*scenes], CountMethod("rough", steps=1), seed=1)
+    enter(done, "rough")
+    (board,) = gather(done / "board", (done / "out",))[0]
+    rows = {r.name: r for r in board.rows}
+    assert [r["method"]["seed"] for r in rows["out/rough"].records] == [0, 1], "the entry is of seed 0 alone"
+    assert all(set(rows[name].predictions) == set(board.scenes) for name in ("rough", "out/rough"))
+    files = {"predictions": done / "out/seed-1/predictions/rough", "scenes": scenes}
+    submit(done / "out/seed-1/results/rough.json", leaderboard=done / "board", **files)
+    (board,) = gather(done / "board", (done / "out/seed-1",))[0]
+    (row,) = board.rows
+    assert len(row.records) == 2 and not row.predictions, "it shows the images of seed 0"
 
 
 def test_a_folder_without_records_is_refused(tmp_path: Path) -> None:
