@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -116,8 +117,18 @@ def gather(
             for records in _by_dataset(of_method):
                 for board in _boards_of(boards, records[0]):
                     _add_run(board, run, records)
+    for board in boards:
+        board.rows[:] = _distinct(board.rows)
     order = (PUBLIC, LOCAL, ARCHIVE)
     return sorted(boards, key=lambda b: order.index(b.folder)), refused
+
+
+def _distinct(rows: Sequence[Row]) -> Iterator[Row]:
+    """Yield rows with a number after each further one of a name: the page finds rows by their names."""
+    count = Counter[str]()
+    for row in rows:
+        count[row.name] += 1
+        yield row if count[row.name] == 1 else replace(row, name=f"{row.name} ({count[row.name]})")
 
 
 def _as_entered(record: Record, entered: Sequence[Record]) -> Record:
@@ -220,11 +231,12 @@ def _folders(run: Path, record: Record) -> dict[str, Path]:
 
 
 def find_board(boards: Sequence[Board], name: str) -> Board:
-    """Return the board of a name. Raises UserError where there is none."""
-    for board in boards:
-        if board.name == name:
+    """Return the first board of a name, or the one that `titles` calls so. Raises UserError where there is none."""
+    known = titles(boards)
+    for board, title in zip(boards, known, strict=True):
+        if name in (board.name, title):
             return board
-    names = ", ".join(dict.fromkeys(b.name for b in boards))
+    names = ", ".join(known)
     if name in {track.name for track in current_release().tracks}:
         fix = f"choose one of {names}, or enter the first result with `spike4dgs submit`"
         raise problem("--track", "a track with entries", f"{name}, which has none yet", fix)

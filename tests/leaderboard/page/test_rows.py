@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -81,6 +82,18 @@ def test_a_run_of_other_seeds_than_an_entry_is_a_row_or_lends_no_images(done: Pa
     (board,) = gather(done / "board", (done / "out/seed-1",))[0]
     (row,) = board.rows
     assert len(row.records) == 2 and not row.predictions, "it shows the images of seed 0"
+
+
+def test_rows_and_boards_of_one_name_are_told_apart(done: Path) -> None:
+    """Runs whose folders have one name, and their boards of one scene in two revisions."""
+    record = read_record(done / "out/results/rough.json")
+    for folder, sha256, revision in (("a/x", "1", "3"), ("b/x", "2", "3"), ("c/x", "2", "4")):
+        other = json.loads(json.dumps(record).replace(record["dataset"]["scenes"]["pattern-0"], revision * 64))
+        other["scenes"]["pattern-0"]["predictions_sha256"] = sha256 * 64
+        write_json(done / folder / "results/rough.json", other)
+    boards = [b for b in gather(done / "none", [done / name for name in ("a/x", "b/x", "c/x")])[0] if b.rows]
+    assert [[row.name for row in board.rows] for board in boards] == [["x/rough", "x/rough (2)"], ["x/rough"]]
+    assert [find_board(boards, title) for title in titles(boards)] == boards
 
 
 def test_a_folder_without_records_is_refused(tmp_path: Path) -> None:
