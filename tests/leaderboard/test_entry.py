@@ -13,7 +13,7 @@ from changes import edit_json, files_in
 from submissions import board, edit_with_ledger, enter, entry_of, read, release_of, submit
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import locked, write_bytes
+from spike4dgs.benchmark.files import locked, write_bytes, write_json
 from spike4dgs.leaderboard import entry
 from spike4dgs.leaderboard.entry import check_numbers, entry_path, remove_parts, write_entry
 from spike4dgs.leaderboard.rank import write_boards
@@ -112,18 +112,26 @@ def test_names_that_differ_by_case_alone_are_refused(done: Path) -> None:
 def test_a_seed_of_its_own_is_an_entry_of_its_own(done: Path) -> None:
     record = json.loads((done / "out/results/tfp+4dgs.json").read_text())
     assert entry_path(record).endswith("/tfp+4dgs.json")
-    record["method"]["seed"] = 7
-    assert entry_path(record).endswith("/tfp+4dgs@seed-7.json")
-    for seed in (-1, 10**30):
+    for seed in (7, 2**63 - 1):
         record["method"]["seed"] = seed
-        with pytest.raises(UserError, match="expected a seed"):
+        write_json(done / "seeded.json", record)
+        assert submit(done / "seeded.json", leaderboard=done / "board") == 0
+        assert read(entry_of(done, f"tfp+4dgs@seed-{seed}"))["record"]["method"]["seed"] == seed
+    for seed in (-1, 2**63, 10**30):
+        record["method"]["seed"] = seed
+        with pytest.raises(UserError, match="expected a seed from 0 up, of 64 bits"):
             entry_path(record)
+    write_json(done / "seeded.json", record | {"method": record["method"] | {"seed": 2**63}})
+    with pytest.raises(UserError):
+        submit(done / "seeded.json", leaderboard=done / "board")
 
 
 @pytest.mark.parametrize("value", [1e308, -1e16, 10**400, float("nan"), float("inf"), 1.0000001e15])
 def test_numbers_out_of_bounds_are_refused(value: float) -> None:
     with pytest.raises(UserError, match=r"expected numbers within \+-1e\+15"):
         check_numbers({"a": [1, {"b": value}]}, Path("x"))
+    with pytest.raises(UserError, match="expected numbers within"):
+        check_numbers({"seed": [value]}, Path("x"))
     check_numbers({"a": [1e15, -3, None, True, "1e400"]}, Path("x"))
 
 
