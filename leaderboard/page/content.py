@@ -64,9 +64,7 @@ def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:
     method = row.first["method"]
     cells = [[r["scenes"][scene] for r in row.records] for scene in scenes]
     params = method["params"]
-    machines = {
-        _machine(r["scenes"][s]["fitted_with"]["environment"] or r["environment"]) for r in row.records for s in scenes
-    }
+    fitted = [c for of in cells for c in of if c["status"] == "ok"]
     return {
         "name": row.name,
         "method": method["name"],
@@ -77,8 +75,8 @@ def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:
         "why": row.why,
         "seeds": [r["method"]["seed"] or 0 for r in row.records],
         "parts": {p: str(params[p]) if isinstance(params.get(p), str) else "none" for p in PARTS},
-        "budget": _distinct(_budget(c["budget"]) for of in cells for c in of if c["status"] == "ok"),
-        "hardware": _distinct(machines),
+        "budget": _distinct(_budget(c["budget"]) for c in fitted),
+        "hardware": _distinct(_machine(c["fitted_with"]["environment"] or {}) for c in fitted),
         "given": list(method.get("given", DEFAULT_GIVEN)),
         "trainedOn": len(method["trained_on"]),
         "cells": [_cell(of) for of in cells],

@@ -64,6 +64,12 @@ def test_sensors_are_the_releases_or_what_records_state(committed: list[Board]) 
     assert [scene["sensor"] for scene in board_content(board("b", made), "b")["scenes"]] == ["ideal", "noisy"]
 
 
+def test_the_hardware_is_that_of_the_fit() -> None:
+    nowhere = {"environment": None, "harness": None}
+    rows = [row("a", {"s": cell({}), "t": failed()}), row("b", dict.fromkeys("st", cell({}, fitted_with=nowhere)))]
+    assert [r["hardware"] for r in board_content(board("b", rows), "b")["rows"]] == ["a CPU", "not stated"]
+
+
 def test_a_metric_that_nobody_computed_again_gives_no_rank() -> None:
     """A false LPIPS, where the verifier lacked the weights."""
     values = {"psnr": np.full(2, 20.0), "lpips_vgg": np.full(2, 0.3)}
