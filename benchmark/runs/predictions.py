@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.environment import utc_now
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import MOST_BYTES, read_json, sha256_file, write_bytes, write_json, write_text, writing
+from spike4dgs.benchmark.runs.held_out import targets_of
 from spike4dgs.benchmark.scene.images import read_exr, write_exr
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
@@ -229,9 +230,10 @@ def write_predictions(
 ) -> Path:
     """Write the images that any program made of a scene's targets as a predictions folder, and return its path.
 
-    `images`: gray linear radiance [H, W], 1.0 = white, for each of `scene.targets`; `method`: the program's name. An
-    earlier folder at `root` is replaced if it holds predictions. Raises UserError for missing or further targets, for
-    other shapes or values that are not finite, and where something else is at `root`.
+    `images`: gray linear radiance [H, W], 1.0 = white, for each of `scene.targets`; of a recording, which has none, for
+    each tick at which `score` compares spikes. `method`: the program's name. An earlier folder at `root` is replaced if
+    it holds predictions. Raises UserError for missing or further targets, for other shapes or values that are not
+    finite, where something else is at `root`, and for a recording that holds no camera out.
 
     For example::
 
@@ -240,8 +242,8 @@ def write_predictions(
     """
     root, opened = Path(root).absolute(), scene if isinstance(scene, Scene) else open_scene(scene)
     check_place(root)
-    fix = "give an image for each of scene.targets"
-    _same_names(root, {t.name for t in images}, {t.name for t in opened.targets}, "the scene's targets", fix)
+    fix = "give an image for each target, and no others"
+    _same_names(root, {t.name for t in images}, {t.name for t in targets_of(opened)}, "the scene's targets", fix)
     with PredictionWriter(root) as writer:
         for target, image in images.items():
             camera = opened.cameras[target.camera]

@@ -17,7 +17,7 @@ from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.metrics.measure import select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.held_out import SPIKE_METRICS, has_truth, targets_of
-from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter
+from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter, write_predictions
 from spike4dgs.benchmark.runs.record import Cell, check_record, read_record, with_later_metrics, write_record
 from spike4dgs.benchmark.runs.score import open_for, score_predictions, score_scene
 from spike4dgs.benchmark.scene.manifest import write_manifest
@@ -87,6 +87,16 @@ def test_a_recording_is_scored_by_its_spikes_alone(small_scene: Path, tmp_path: 
     assert main(["score", str(good), str(scene.root), "--out", str(tmp_path / "by_command.json")]) == 0
     by_command = read_record(tmp_path / "by_command.json")["scenes"][scene.id]["metrics"]
     assert {m: by_command[m] for m in SPIKE_METRICS} == {m: cell["metrics"][m] for m in SPIKE_METRICS}
+
+
+def test_images_of_any_program_become_predictions_of_a_recording(small_scene: Path, tmp_path: Path) -> None:
+    scene = open_scene(bare_copy(small_scene, tmp_path / "bare"))
+    camera = scene.cameras["cam_03"]
+    images = {t: np.full((camera.height, camera.width), 0.45, np.float32) for t in targets_of(scene)}
+    record = score_predictions(write_predictions(tmp_path / "mine", scene, images, "mine"), [scene], CHOSEN)
+    assert record["mean"]["spike_psnr_20"] > 5
+    with pytest.raises(UserError, match=r"the scene's targets, found 3 missing: cam_03/000020, .*; give an image"):
+        write_predictions(tmp_path / "none", scene, {}, "mine")
 
 
 def test_truth_that_is_not_wanted_is_not_read(small_scene: Path, tmp_path: Path) -> None:
