@@ -34,7 +34,7 @@ class Point:
     name: str
     color: Any
     scenes: dict[str, tuple[float, float]]
-    of: int  # scenes of the record
+    of: int  # scenes of all records
 
     @property
     def x(self) -> float:
@@ -81,7 +81,7 @@ def make_scatter(records: Sequence[Record]) -> Figure:
 
 def points_of(records: Sequence[Record], metric: str) -> list[Point]:
     """Return the methods that have a value and a fit time of any scene."""
-    found = []
+    found, scenes = [], {scene for record in records for scene in record["scenes"]}
     for i, record in enumerate(records):
         known = {
             scene: (max(cell["fit_seconds"], LEAST_SECONDS), cell["metrics"][metric])
@@ -89,7 +89,7 @@ def points_of(records: Sequence[Record], metric: str) -> list[Point]:
             if cell["metrics"][metric] is not None and cell["fit_seconds"] is not None
         }
         if known:
-            found.append(Point(record["method"]["name"], method_color(i), known, len(record["scenes"])))
+            found.append(Point(record["method"]["name"], method_color(i), known, len(scenes)))
     return found
 
 

@@ -88,6 +88,8 @@ def test_methods_that_are_close_have_no_floor() -> None:
 def test_a_mean_of_fewer_scenes_says_so_and_no_values_are_no_error() -> None:
     some = [record("whole", {"a": (30, 50), "b": (32, 60)}), record("part", {"a": (31, 55), "b": None})]
     assert set(labels(make_scatter(some).axes[0])) == {"whole", "part (1 of 2 scenes)"}
+    some = [record("whole", {"a": (30, 50), "b": (32, 60)}), record("part", {"a": (31, 55)})]
+    assert set(labels(make_scatter(some).axes[0])) == {"whole", "part (1 of 2 scenes)"}, "also where a record has none"
     assert not labels(make_scatter([record("none", {"a": None})]).axes[0])
 
 
