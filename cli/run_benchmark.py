@@ -234,7 +234,8 @@ def _finish(runs: Sequence[SplitRun], scenes: tuple[Path, ...], allow_gaps: bool
             highlight=False,
             markup=False,
         )
-        cells = [(r["method"], scene, c["status"]) for r in run.records for scene, c in r["scenes"].items()]
+        ids = [scene.id for scene in run.scenes]  # not those that the records keep of earlier runs
+        cells = [(r["method"], scene, r["scenes"][scene]["status"]) for r in run.records for scene in ids]
         failed += [f"{m['name']} on {scene}, seed {m['seed']}" for m, scene, status in cells if status == "failed"]
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)

@@ -45,7 +45,7 @@ def run_split(
     """Fit methods on scenes or resume them, print the table, and write table and images."""
     out = settings.out
     records = run_matrix(scenes, methods, settings, console)
-    earlier, left_out = earlier_records(out, records)
+    earlier, left_out = earlier_records(out, records, [scene.id for scene in scenes])
     lines = [f"not in the table: {line}" for line in left_out]
     every = [*earlier, *records]
     _say(console, *lines)

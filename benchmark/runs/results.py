@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import visible, write_text
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import open_predictions
-from spike4dgs.benchmark.runs.record import COSTS, Record, read_record
+from spike4dgs.benchmark.runs.record import COSTS, Record, of_scenes, read_record
 from spike4dgs.benchmark.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -74,13 +74,15 @@ def record_paths(run: Path) -> list[Path]:
     return [*visible(run, "results/*.json"), *visible(run, "seed-*/results/*.json")]
 
 
-def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Record], list[str]]:
-    """Return the records of other methods in a run's `folder` on the same scenes, revisions and split, oldest first.
+def earlier_records(folder: Path, records: Sequence[Record], scenes: Collection[str]) -> tuple[list[Record], list[str]]:
+    """Return the records of other methods in a run's `folder` on the run's `scenes`, by id, oldest first.
 
-    All seeds of a method come together. Also return what is left out, a file name and a reason each: other scenes, or
-    no record that this version reads.
+    They are of the revisions and split of the run's `records`, and have no scene that these lack. All seeds of a method
+    come together, each once. Also return what is left out, a file name and a reason each: other scenes, or no record
+    that this version reads.
     """
-    names, dataset = {r["method"]["name"] for r in records}, records[0]["dataset"]
+    names, split = {r["method"]["name"] for r in records}, records[0]["dataset"]["split"]
+    revisions = {scene: revision for r in records for scene, revision in r["dataset"]["scenes"].items()}
     found, left_out = [], []
     for path in record_paths(folder):
         if path.stem in names:
@@ -90,8 +92,9 @@ def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Recor
         except UserError as e:
             left_out.append(str(e))
             continue
-        if record["dataset"] == dataset:
-            found.append(record)
+        same = [scene for scene, revision in record["dataset"]["scenes"].items() if revision == revisions.get(scene)]
+        if record["dataset"]["split"] == split and set(scenes) <= set(same):
+            found.append(of_scenes(record, same))
         else:
             left_out.append(f"{path}: other scenes, revisions or split")
     first: dict[str, str] = {}
@@ -103,7 +106,15 @@ def earlier_records(folder: Path, records: Sequence[Record]) -> tuple[list[Recor
         method = record["method"]
         return first[method["name"]], method["name"], method["seed"] or 0
 
-    return sorted(found, key=order), left_out
+    return sorted(of_each_seed(found), key=order), left_out
+
+
+def of_each_seed(records: Sequence[Record]) -> list[Record]:
+    """Return the first record of each method and seed, in the order of `record_paths`.
+
+    It is the newest one: the folder of the first seed holds a method's last run, those of further seeds also others'.
+    """
+    return list({(r["method"]["name"], r["method"]["seed"]): r for r in reversed(records)}.values())[::-1]
 
 
 def of_one_seed(records: Sequence[Record]) -> list[Record]:

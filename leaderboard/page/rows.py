@@ -12,7 +12,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
 from spike4dgs.benchmark.runs.refinement import is_refined
-from spike4dgs.benchmark.runs.results import record_paths
+from spike4dgs.benchmark.runs.results import of_each_seed, record_paths
 from spike4dgs.leaderboard.entry import Entry
 from spike4dgs.leaderboard.rank import REFINED, make_boards, reason
 from spike4dgs.leaderboard.reading import Reading, read_briefs, read_checked
@@ -149,10 +149,10 @@ def _by_dataset(records: Sequence[Record]) -> list[list[Record]]:
 
 
 def run_records(run: Path) -> list[Record]:
-    """Return the records of a finished run, of all seeds. Raises UserError where there is none."""
+    """Return the records of a finished run, each seed once. Raises UserError where there is none."""
     if not (paths := record_paths(run)):
         raise problem(run, "a folder of run-benchmark with results/*.json", "none", "check the path of --runs")
-    return [read_record(path) for path in paths]
+    return of_each_seed([read_record(path) for path in paths])
 
 
 def _board(leaderboard: Path, folder: str, board: Mapping[str, Any], reading: Reading) -> Board:

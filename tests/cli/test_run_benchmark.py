@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from spike4dgs.benchmark.reports import benchmark
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
 from spike4dgs.cli import run_benchmark as command
+from spike4dgs.leaderboard.page.rows import run_records
 
 # fits in this process: to start one for each takes longer than the fit
 run_here = partial(run_benchmark, in_process=True)
@@ -151,6 +153,45 @@ def test_records_that_do_not_belong_there_are_left_out_and_named(
     assert "results/counts.json: other scenes, revisions or split" in text
     assert "results/damaged.json: expected a spike4dgs-result/1 record (JSON)" in text
     assert [r["method"] for r in csv.DictReader((out / "results.csv").read_text().splitlines())] == ["quick+counts"]
+
+
+@pytest.mark.usefixtures("installed", "no_images")
+def test_scenes_that_a_record_keeps_of_earlier_runs_change_neither_the_table_nor_the_exit_code(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, other = tmp_path / "out", write_small_scene(tmp_path / "other", seed=5)
+
+    def go(scenes: Sequence[Path], *methods: str) -> int:
+        return run_here(scenes, methods=methods, out=out, device="cpu", metrics=("psnr",))
+
+    def rows() -> list[tuple[str, str]]:
+        return [(r["method"], r["scene"]) for r in csv.DictReader((out / "results.csv").read_text().splitlines())]
+
+    assert go((small_scene,), "quick+counts") == 0
+    assert go((small_scene, other), "counts") == 0
+    for methods in (("counts",), ("counts", "plays-back"), ("plays-back", "counts")):
+        assert go((small_scene,), *methods) == 0
+        of_counts = [("counts", "pattern-5"), ("counts", "pattern-0")]
+        assert rows()[0] == ("quick+counts", "pattern-0") and set(of_counts) <= set(rows())
+    assert "not in the table" not in capsys.readouterr().out.rpartition("plays-back on pattern-0")[2]
+    with monkeypatch.context() as patch:
+        patch.setattr(CountMethod, "fit", FailingMethod.fit)
+        patch.setattr(CountMethod, "_result", ValueError("no luck"), raising=False)
+        assert go((other,), "quick+counts") == 1
+    capsys.readouterr()
+    assert go((small_scene,), "quick+counts") == 0
+    assert "failed" not in capsys.readouterr().err and ("quick+counts", "pattern-5") in rows(), "the record has it"
+
+
+@pytest.mark.usefixtures("installed", "no_images")
+def test_a_seed_that_ran_again_as_the_first_is_counted_once(small_scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for method, options in (("counts", {"seeds": 3}), ("counts", {"seed": 1}), ("quick+counts", {})):
+        run_here((small_scene,), methods=(method,), out=out, device="cpu", metrics=("psnr",), **options)
+    rows = [(r["method"], r["seed"]) for r in csv.DictReader((out / "results.csv").read_text().splitlines())]
+    assert rows == [("counts", "1"), ("counts", "2"), ("quick+counts", "0")]
+    seeds = [(r["method"]["name"], r["method"]["seed"]) for r in run_records(out)]
+    assert sorted(seeds) == sorted((name, int(seed)) for name, seed in rows)
 
 
 @pytest.mark.usefixtures("installed", "no_images")
