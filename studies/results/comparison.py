@@ -69,7 +69,8 @@ class MeasuredRow:
     def mean_cost(self, name: str) -> float | None:
         """Return the mean of a cost; None where a cell has none."""
         found = [self.cells[scene, seed].get(name) for scene in self.scenes for seed in self.seeds]
-        return None if None in found or not found else float(np.mean(found))
+        costs = [cost for cost in found if cost is not None]
+        return float(np.mean(costs)) if costs and len(costs) == len(found) else None
 
     @property
     def is_quiet(self) -> bool:
