@@ -67,6 +67,8 @@ def make(
         settings = scenes.SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=seed.rendering)
         return scenes.make_dataset([settings.job(seed.world)], out, workers=workers)
 
+    for world in worlds:  # a typo is told before the secret is drawn, which would keep it
+        scenes.SceneSettings(profile, rendering=rendering).job(world)
     folder = season_folder(seasons, number)
     if make_season(
         number,

@@ -112,6 +112,16 @@ def test_other_arguments_are_refused(options: dict[str, Any], message: str, once
         command(once, **options)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"profile": "smal"}, "--profile: expected one of"), ({"worlds": ("car", "vna")}, "world: expected one of")],
+)
+def test_a_typo_leaves_no_secret(options: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=message):
+        command(Made(tmp_path), **options)
+    assert not list(tmp_path.iterdir())
+
+
 def test_another_version_of_the_code_does_not_finish_a_season(made: Made) -> None:
     path = made.secret / OPENING_NAME
     data = json.loads(path.read_text())
