@@ -37,8 +37,8 @@ def image_scores(board: Board, metric: str) -> ImageScores:
     """Return the scores of a metric.
 
     A row is compared if it may be ranked, the metric was computed again from its images, and it has a score for every
-    image that most rows have one for. An image without a score in every row, such as the first of a temporal error, has
-    no part in any mean.
+    image that any of these rows has one for. An image without a score in every row, such as the first of a temporal
+    error, has no part in any mean.
     """
     left_out = {i: row.why or "not ranked" for i, row in enumerate(board.rows) if not row.ranked}
     claimed = f"{METRICS[metric].title} as claimed: nobody computed it again"

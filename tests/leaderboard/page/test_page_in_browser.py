@@ -96,6 +96,22 @@ def labels_board() -> Board:
     return board("labels", [of("claims", "re-scored", 0.1, ["lpips_vgg"], None), fitted])
 
 
+def flags_board() -> Board:
+    """Two ranked rows, a copy of the truth, a claim and an own run: the less they prove, the better and quicker."""
+
+    def of(name: str, psnr: float, why: str = "", label: str = "re-scored") -> Any:
+        cells = {"s": cell({"psnr": np.full(3, psnr)}, fit_seconds=500 / psnr)}
+        return row(name, cells, label=label, ranked=not why, why=why)
+
+    rows = [
+        of("honest", 40),
+        of("copy", 100, "equals truth (s)"),
+        of("claim", 90, "nothing", "claimed"),
+        of("other", 30),
+    ]
+    return board("flags", [*rows, of("own", 35, "t failed", "own run")])
+
+
 def sheets_board(finished: Path, folder: Path) -> Board:
     """The entries of a run, which have thumbnails, without the run."""
     names = ("tfp+4dgs", "rough")
@@ -118,7 +134,7 @@ def folder(finished: Path, data: Path, tmp_path_factory: pytest.TempPathFactory)
     out = tmp_path_factory.mktemp("page") / "page"
     boards, refused = gather(COMMITTED, (finished / "out",))
     sheets = sheets_board(finished, tmp_path_factory.mktemp("sheets") / "board")
-    made = [seeds_board(), sensors_board(), hostile_board(), labels_board(), sheets]
+    made = [seeds_board(), sensors_board(), hostile_board(), labels_board(), flags_board(), sheets]
     write_site(out, [*boards, *made], [*refused, {"entry": HOSTILE, "reason": HOSTILE}], data)
     return out
 
@@ -242,6 +258,21 @@ def test_a_claimed_value_is_not_first_and_says_so(page: Page) -> None:
     assert page.value(f"{cells}.map(r => r.cells[2].classList.contains('best'))") == [True, False]
     notes = page.value(f"{cells}.map(r => r.querySelector('th').textContent)")
     assert "as claimed, not computed again: LPIPS" in notes[1] and "as claimed" not in notes[0]
+
+
+def test_an_entry_without_a_rank_is_below_not_the_best_and_not_on_the_front(page: Page) -> None:
+    go(page, "t=flags")
+    assert names(page) == ["honest", "own", "other", "copy", "claim"]
+    cells = "[...document.querySelectorAll('#table tbody tr')]"
+    assert page.value(f"{cells}.map(r => r.cells[2].classList.contains('best'))") == [True, *[False] * 4]
+    plot = "document.querySelector('#plots figure svg')"
+    assert page.value(f"{plot}.querySelectorAll('g[fill=\"#999\"] circle').length") == 2
+    front = page.value(f"{plot}.querySelector('g[aria-label=line] path').getAttribute('d')")
+    shown = f"[...{plot}.querySelectorAll('g:not([fill=\"#999\"]) > circle')]"
+    points = page.value(f"{shown}.map(c => [Number(c.getAttribute('cy')), Number(c.getAttribute('cx'))])")
+    assert [float(v) for v in re.findall(r"[\d.]+", front)][:2] == pytest.approx(min(points)[::-1], abs=0.01)
+    go(page, "t=flags&s=name")
+    assert names(page) == ["claim", "copy", "honest", "other", "own"]
 
 
 def better_of(page: Page, name: str, scenes: list[int]) -> Any:

@@ -14,7 +14,7 @@ Spike4DGS.controls = (() => {
   const LIMITS = { maxfit: "Fit at most, s a scene", minfps: "Images/s at least", maxmem: "Memory at most, MB",
     maxmodel: "Model at most, MB" };
 
-  /* The links that answer a question in one click. The track is the open one with the most rows. */
+  /* The links that answer a question in one click. The track is the first that withholds nothing. */
   function questions(page, link) {
     const tracks = page.boards.filter((b) => b.folder === "entries");
     const track = tracks.find((b) => !b.withheld.length) ?? page.boards[0];

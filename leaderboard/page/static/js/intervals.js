@@ -1,6 +1,6 @@
 "use strict";
-/* Rank intervals over the scenes that the reader chose: the twin of leaderboard/page/intervals.py and draws.py, with the
-   same random numbers. A test compares the two. */
+/* Rank intervals over the scenes that the reader chose: the twin of leaderboard/page/intervals.py, with the same random
+   numbers. A test compares the two. */
 Spike4DGS.intervals = (() => {
   function lowbias32(x) {
     x = Math.imul(x ^ (x >>> 16), 0x7feb352d);

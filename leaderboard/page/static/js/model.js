@@ -26,6 +26,10 @@ Spike4DGS.model = (() => {
     return sensed.length ? sensed : chosen;
   }
 
+  /* Return whether a row stands below the others: an entry without a rank, such as a claim or a flagged one, on a board
+     that has ranks. Nobody vouches for an own run, but for its reader. */
+  const isBelow = (board, row) => board.scored.length > 0 && !row.ranked && row.label !== "own run";
+
   const cache = new WeakMap(); // board -> what was computed of it before, by a text
 
   function remembered(board, key, compute) {
@@ -118,16 +122,18 @@ Spike4DGS.model = (() => {
     const sortBy = state.s === "name" ? "name" : column;
     const higher = sortBy === "name" ? false : page.index.get(sortBy)?.higher;
     const descending = state.d ? state.d === "desc" : higher;
-    shown.sort(order(sortBy, descending));
+    shown.sort(order(board, sortBy, descending));
     return { board, scenes, metric, columns: shownColumns, shown, hidden, sortBy, descending };
   }
 
-  function order(column, descending) {
+  function order(board, column, descending) {
     const sign = descending ? -1 : 1;
     const byName = (a, b) => (a.row.name < b.row.name ? -1 : a.row.name > b.row.name ? 1 : a.index - b.index);
     if (column === "name") return (a, b) => sign * byName(a, b);
     const proven = (item) => (item.row.unverified.includes(column) ? null : item.values[column]);
+    const below = (item) => isBelow(board, item.row);
     return (a, b) => {
+      if (below(a) !== below(b)) return below(a) - below(b);
       const x = proven(a);
       const y = proven(b);
       if (x === null || y === null) return (x === null) - (y === null) || byName(a, b);
@@ -135,5 +141,5 @@ Spike4DGS.model = (() => {
     };
   }
 
-  return { COSTS, facetValues, metricsOf, view };
+  return { COSTS, facetValues, isBelow, metricsOf, view };
 })();

@@ -1,8 +1,8 @@
 "use strict";
-/* Quality against each cost. Families are coloured, rows that the filters hide are gray. */
+/* Quality against each cost. Families are coloured, rows that the filters hide and entries without a rank are gray. */
 Spike4DGS.plots = (() => {
   const { el, byId, fill, format, heading } = Spike4DGS.dom;
-  const { COSTS } = Spike4DGS.model;
+  const { COSTS, isBelow } = Spike4DGS.model;
   const COLOR_BY = { motion: "motion", images: "images from spikes", initialization: "initialization", supervision: "supervision" };
   const COLORS = ["#4269d0", "#d97a00", "#c2304a", "#1b8a7a", "#8c5fd3", "#6a7f10", "#b0568a", "#7a5540"];
   const WIDTH = 420;
@@ -38,7 +38,7 @@ Spike4DGS.plots = (() => {
     for (const [n, id] of COSTS.entries()) {
       if (n) await new Promise((resolve) => setTimeout(resolve));
       if (!current()) return;
-      grid.append(figure(page.index.get(id), metric, items, range, color, far));
+      grid.append(figure(page.index.get(id), metric, items, range, color, far, (item) => isBelow(view.board, item.row)));
     }
     const told = [...far].map((item) => `${item.row.name} (${format(metric, item.values[view.metric])}, fit ${seconds(item.values.fit_seconds)})`);
     if (told.length) edge.textContent = `On the edge, beyond an axis (▼ ◀ ▶): ${told.join(", ")}.`;
@@ -107,10 +107,10 @@ Spike4DGS.plots = (() => {
     return found;
   }
 
-  function figure(cost, metric, items, range, color, far) {
+  function figure(cost, metric, items, range, color, far, below) {
     const points = items.filter((item) => item.values[cost.id] > 0).map((item) => ({
       item, name: item.row.name, cost: item.values[cost.id], value: item.values[metric.id],
-      y: range.clamp(item.values[metric.id]), hidden: Boolean(item.why) }));
+      y: range.clamp(item.values[metric.id]), why: item.why ? "hidden by filters" : below(item) ? "not ranked" : "" }));
     const without = items.length - points.length;
     const title = `${metric.title} against ${cost.title}`;
     const caption = el("figcaption", {}, heading(cost), without ? el("span", { class: "note" }, ` ${without} without a positive value`) : null);
@@ -121,15 +121,15 @@ Spike4DGS.plots = (() => {
     for (const p of points) {
       p.x = Math.min(Math.max(p.cost, domain[0]), domain[1]);
       p.mark = p.x < p.cost ? "▶" : p.x > p.cost ? "◀" : p.y !== p.value ? "▼" : "";
-      if (p.mark && !p.hidden) far.add(p.item);
+      if (p.mark && !p.item.why) far.add(p.item);
     }
-    const best = front(points.filter((p) => !p.hidden), metric.higher, !cost.higher);
+    const shown = points.filter((p) => !p.why);
+    const best = front(shown, metric.higher, !cost.higher);
     const [bottom, top] = metric.higher ? range.ends : [...range.ends].reverse();
     const toX = d3.scaleLog(domain, [MARGINS.left, WIDTH - MARGINS.right]);
     const toY = d3.scaleLinear([bottom, top], [HEIGHT - MARGINS.bottom, MARGINS.top]);
-    const shown = points.filter((p) => !p.hidden);
     const names = labelled([...[...best].reverse(), ...shown.filter((p) => !best.includes(p))], (p) => [toX(p.x), toY(p.y)], points);
-    const tipText = (p) => `${p.name}\n${metric.title} ${p.value.toFixed(metric.digits)}\n${cost.title} ${p.cost.toFixed(cost.digits)}${p.hidden ? "\nhidden by filters" : ""}`;
+    const tipText = (p) => `${p.name}\n${metric.title} ${p.value.toFixed(metric.digits)}\n${cost.title} ${p.cost.toFixed(cost.digits)}${p.why && `\n${p.why}`}`;
     const plot = Plot.plot({
       width: WIDTH, height: HEIGHT, marginLeft: MARGINS.left, marginRight: MARGINS.right, marginTop: MARGINS.top, marginBottom: MARGINS.bottom, style: { background: "none", fontSize: "12px" },
       ariaLabel: title, ariaDescription: "The table has the same values.",
@@ -137,7 +137,7 @@ Spike4DGS.plots = (() => {
       y: { domain: [bottom, top], label: heading(metric), grid: true, nice: false, ticks: 5 },
       marks: [
         Plot.line(best, { x: "x", y: "y", curve: cost.higher ? "step-before" : "step-after", stroke: "currentColor", strokeOpacity: 0.35 }),
-        Plot.dot(points.filter((p) => p.hidden), { x: "x", y: "y", r: 4, fill: "#999", fillOpacity: 0.6 }),
+        Plot.dot(points.filter((p) => p.why), { x: "x", y: "y", r: 4, fill: "#999", fillOpacity: 0.6 }),
         Plot.dot(shown.filter((p) => !p.mark), { x: "x", y: "y", r: 5, fill: (p) => color(p.item), stroke: "var(--ground)" }),
         Plot.text(shown.filter((p) => p.mark), { x: "x", y: "y", text: "mark", fill: (p) => color(p.item) }),
         ...names.map(({ p, dx, dy, anchor }) => Plot.text([p], { x: "x", y: "y", text: "name", dx, dy, textAnchor: anchor,

@@ -2,6 +2,7 @@
 /* The ranking: a real table, with what is hidden counted above it. */
 Spike4DGS.table = (() => {
   const { el, byId, fill, format, heading, plural } = Spike4DGS.dom;
+  const { isBelow } = Spike4DGS.model;
   const MOST = 50; // rows that are drawn, for speed; a button shows the others
   const SCREEN = 20; // rows that are drawn at once; the rest follows when these are on the screen
   let rest = () => {};
@@ -41,7 +42,7 @@ Spike4DGS.table = (() => {
         el("button", { type: "button", class: "link", "aria-haspopup": "dialog", onclick: () => act.change({ row: item.row.name }) }, item.row.name),
         note(view, item)),
       view.columns.map((c) => [
-        el("td", { class: isBest(item, c, best) ? "number best" : "number" }, format(c, item.values[c.id])),
+        el("td", { class: isBest(view, item, c, best) ? "number best" : "number" }, format(c, item.values[c.id])),
         c === metric && paper && el("td", { class: "number paper" }, format(c, item.published))]),
       el("td", { class: "nowrap", title: PROOFS[item.row.label] }, labelOf(item.row)));
     const body = el("tbody", {}, rows.slice(0, SCREEN).map(line));
@@ -63,12 +64,13 @@ Spike4DGS.table = (() => {
   }
 
   const isClaimed = (item, c) => item.row.unverified.includes(c.id);
-  const isBest = (item, c, best) => !isClaimed(item, c) && item.values[c.id] !== null && item.values[c.id] === best[c.id];
+  const counts = (view, item, c) => !isClaimed(item, c) && !isBelow(view.board, item.row) && item.values[c.id] !== null;
+  const isBest = (view, item, c, best) => counts(view, item, c) && item.values[c.id] === best[c.id];
 
   function bestValues(view) {
     const found = {};
     for (const c of view.columns) {
-      const values = view.shown.filter((item) => !isClaimed(item, c)).map((item) => item.values[c.id]).filter((v) => v !== null);
+      const values = view.shown.filter((item) => counts(view, item, c)).map((item) => item.values[c.id]);
       found[c.id] = values.length ? (c.higher ? Math.max(...values) : Math.min(...values)) : null;
     }
     return found;
