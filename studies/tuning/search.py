@@ -214,29 +214,18 @@ def _recipe(name: str) -> RecipeMethod:
 
 def write_results(out: Path) -> None:
     """Write OUT/tuning.md, what each search in OUT found, and its trials as OUT/ROW@STEPS.csv."""
-    records = _records(out)
-    for record in records:
-        done = record["trials"]
-        heads = ["trial", *done[0]["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in _METRICS), "seconds"]
-        write_csv(out / _csv_name(record), heads, [_line(trial, record["scenes"]) for trial in done])
-    write_text(out / "tuning.md", "\n".join([*_table(records), ""]))
-
-
-def _csv_name(record: Mapping[str, Any]) -> str:
-    return f"{record['row']}@{_short(record['budget'])}.csv"
-
-
-def _table(records: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the lines of a table with what each search found."""
     columns = ("row", "steps", "as it is: whole / moving, dB", "best: whole / moving, dB", "trials", "hours", "changed")
     rows = []
-    for record in records:
+    for record in _records(out):
         done = record["trials"]
         first, best = done[0], best_of(done, len(record["scenes"]))
         changed = ", ".join(f"{k} {_short(v)}" for k, v in best["knobs"].items() if v != first["knobs"][k])
-        cells = (_short(record["budget"]), _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
+        steps = _short(record["budget"])
+        cells = (steps, _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
         rows.append((f"`{record['row']}`", *cells))
-    return markdown(columns, rows)
+        heads = ["trial", *first["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in _METRICS), "seconds"]
+        write_csv(out / f"{record['row']}@{steps}.csv", heads, [_line(trial, record["scenes"]) for trial in done])
+    write_text(out / "tuning.md", "\n".join([*markdown(columns, rows), ""]))
 
 
 def _line(trial: Trial, scenes: Iterable[str]) -> list[Any]:
@@ -248,15 +237,13 @@ def _line(trial: Trial, scenes: Iterable[str]) -> list[Any]:
 def publish(out: Path, root: Path) -> None:
     """Write the best settings of the searches in OUT into a checkout, and the table and the trials into its docs.
 
-    What the page has of other rows, and of the same rows at other numbers of steps, stays. Searches of fewer than
-    `TRIALS` trials are named and left out: every row there has had as many.
+    What the page has of other rows, and of the same rows at other numbers of steps, stays. Raises UserError, before
+    anything is written, where a search has fewer than `TRIALS` trials: every row there had as many.
     """
-    records = []
-    for record in _records(out):
-        if len(record["trials"]) >= TRIALS:
-            records.append(record)
-        else:
-            print(f"left out: {record['row']}, {len(record['trials'])} of {TRIALS} trials")
+    records = _records(out)
+    if short := [f"{r['row']}, {len(r['trials'])}" for r in records if len(r["trials"]) < TRIALS]:
+        fix = f"go on with --trials {TRIALS}, or move its file elsewhere"
+        raise problem(out, f"searches of {TRIALS} trials", "; ".join(short), fix)
     for folder, rows in (
         ("method", ours.RECIPES),
         ("baselines", (*theirs.RECIPES, *theirs.CALIBRATED, *theirs.PUBLISHED)),
@@ -269,12 +256,12 @@ def publish(out: Path, root: Path) -> None:
         write_json(path, dict(sorted(found.items())))
     page = root / "docs" / "results" / "tuning.md"
     text = page.read_text(encoding="utf-8")
-    head, rule, *new = _table(records)
+    head, rule, *new = (out / "tuning.md").read_text(encoding="utf-8").splitlines()
     lines = {tuple(line.split(" | ")[:2]): line for line in [*table_rows(text, "searches"), *new]}
     shown = [lines[key] for key in sorted(lines)]
     write_text(page, with_block(text, "searches", [head, rule, *shown]))
-    for name in map(_csv_name, records):
-        write_text(root / "docs" / "results" / "tables" / "tuning" / name, (out / name).read_text(encoding="utf-8"))
+    for path in sorted(out.glob("*.csv")):
+        write_text(root / "docs" / "results" / "tables" / "tuning" / path.name, path.read_text(encoding="utf-8"))
 
 
 def _found(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from changes import files_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,7 +22,6 @@ from spike4dgs.method.images.training import make_training_images
 from spike4dgs.method.settings import override
 from spike4dgs.method.starts.base import StartRequest
 from spike4dgs.method.tuned import read_tuned, tuned
-from spike4dgs.studies.kit.blocks import table_rows
 from spike4dgs.studies.tuning.kept import keeping
 from spike4dgs.studies.tuning.knobs import STEPS_OF_TWO, as_settings, knobs_of, start_of
 from spike4dgs.studies.tuning.search import TRIALS, best_of, gain_of, publish, search, tuning, variant, write_results
@@ -161,15 +161,14 @@ def page(tmp_path):
     return page
 
 
-def test_a_search_of_fewer_trials_is_named_and_not_published(whole, page, tmp_path, capsys):
+def test_a_search_of_fewer_trials_is_not_published(whole, page, tmp_path):
     (out := tmp_path / "out").mkdir()
     (out / "tfp+stg.json").write_text(json.dumps({**whole[0], "trials": whole[0]["trials"][:12]}))
     write_results(out)
-    before = table_rows(page.read_text(), "searches")
-    publish(out, tmp_path)
-    assert capsys.readouterr().out == f"left out: tfp+stg, 12 of {TRIALS} trials\n"
-    assert table_rows(page.read_text(), "searches") == before and not list(page.parent.rglob("*.csv"))
-    assert read_tuned(tmp_path / "baselines" / "tuned.json") == {}
+    before = files_in(tmp_path)
+    with pytest.raises(UserError, match="expected searches of 24 trials, found tfp.stg, 12; go on with --trials 24"):
+        publish(out, tmp_path)
+    assert files_in(tmp_path) == before
 
 
 def test_the_best_settings_become_a_row(whole, page, tmp_path):
