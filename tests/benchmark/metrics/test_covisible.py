@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,37 +12,24 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion
 from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
 
+from spike4dgs.benchmark import Scene, Target, open_scene
 from spike4dgs.benchmark.metrics.covisible import count_views, covisible
 from spike4dgs.benchmark.metrics.measure import select_metrics
-from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter, open_predictions
+from spike4dgs.benchmark.runs.predictions import open_predictions, write_predictions
 from spike4dgs.benchmark.runs.score import score_scene
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.images import read_geometry, write_geometry
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.scene.scene import Scene, open_scene
-from spike4dgs.benchmark.scene.splits import Target
 
 BALL, RADIUS = np.array([0.1, 0.3, 0.5]), 0.5  # above the plane z = 0, before a sky
 LENSES: list[tuple[float, ...]] = [(), (-0.2, 0.03, 0.0, 0.0, 0.0)]
 
 
 def cameras(n: int, lens: tuple[float, ...], width: int = 120, height: int = 80) -> list[Camera]:
-    up = np.array([0.0, 0.0, 1.0])
-    return [
-        replace(
-            look_at(
-                f"cam_{i:02d}",
-                np.array([0.5 * (i - (n - 1) / 2), -3.0, 1.2 + 0.2 * (i % 2)]),
-                np.array([0.3, 0.5, 0.6]),
-                up,
-                focal=0.9 * width,
-                width=width,
-                height=height,
-            ),
-            distortion=lens,
-        )
-        for i in range(n)
-    ]
+    seen: Any = {"target": np.array([0.3, 0.5, 0.6]), "up": np.array([0.0, 0.0, 1.0])}
+    seen |= {"focal": 0.9 * width, "width": width, "height": height}
+    centers = [np.array([0.5 * (i - (n - 1) / 2), -3.0, 1.2 + 0.2 * (i % 2)]) for i in range(n)]
+    return [replace(look_at(f"cam_{i:02d}", center, **seen), distortion=lens) for i, center in enumerate(centers)]
 
 
 def first_hit(origin: NDArray, to: NDArray) -> NDArray:
@@ -115,11 +103,8 @@ def write_depth(root: Path, ticks: tuple[int, ...] = (20,), hidden: NDArray | No
 
 def score(scene: Scene, folder: Path, wrong: NDArray) -> dict:
     """The cell of predictions that are off by 0.3 in some pixels, by 0.01 in the others."""
-    with PredictionWriter(folder) as writer:
-        for target in scene.targets:
-            image = scene.ground_truth(target) + np.where(wrong, np.float32(-0.3), np.float32(0.01))
-            writer.add(target, image.astype(np.float32), scene.t_us(target.tick))
-        writer.finish(PredictionInfo(MethodInfo("example"), scene.id))
+    images = {t: scene.ground_truth(t) + np.where(wrong, np.float32(-0.3), np.float32(0.01)) for t in scene.targets}
+    write_predictions(folder, scene, images, "example")
     return score_scene(open_predictions(folder, scene.targets), scene, select_metrics(("psnr",)))
 
 
@@ -145,9 +130,7 @@ def test_what_moves_hides_the_resting_scene_for_a_time_only(small_scene: Path) -
 def test_fewer_training_cameras_see_fewer_pixels(tmp_path: Path) -> None:
     write_depth(write_small_scene(tmp_path / "scene", splits=True))
     scene = open_scene(tmp_path / "scene")
-    fewer = replace(
-        scene, meta={**scene.meta, "splits": {scene.split: {"train": ["cam_00", "cam_01"], "test": ["cam_03"]}}}
-    )
+    fewer = replace(scene, meta=scene.meta | {"splits": {scene.split: {"train": scene.train[:2], "test": scene.test}}})
     more, less = covisible(scene)["cam_03"], covisible(fewer)["cam_03"]
     assert less.sum() < more.sum() and not (less & ~more).any()
 

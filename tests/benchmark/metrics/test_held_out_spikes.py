@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from spike4dgs.benchmark import METRICS, SpikeStream
 from spike4dgs.benchmark.metrics.held_out_spikes import (
     Recorded,
     Response,
@@ -25,11 +26,9 @@ from spike4dgs.benchmark.metrics.held_out_spikes import (
     view_spikes,
 )
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
-from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.spikes.bits import unpack
 from spike4dgs.benchmark.spikes.gaps import Gap
-from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import simulate_reference
 
@@ -285,10 +284,8 @@ def test_motion_between_targets_is_in_the_expected_counts() -> None:
     recorded = record_around(SpikeStream(packed, WIDTH, HEIGHT, 2e4), TICK, PLAIN)
     level = float(np.interp(TICK, [80, 110], [0.2, 0.8]))
     images = [np.full(SHAPE, v) for v in (0.2, level, 0.8)]
-    pairs = [
-        ImagePair(images[1], images[1], np.ones(SHAPE, bool), "image", spikes=view_spikes(recorded, ticks, used, None))
-        for ticks, used in (([80, 100, 110], images), ([100], images[1:2]))
-    ]
+    views = view_spikes(recorded, [80, 100, 110], images, None), view_spikes(recorded, [100], images[1:2], None)
+    pairs = [ImagePair(images[1], images[1], np.ones(SHAPE, bool), "image", spikes=view) for view in views]
     for metric in ("spike_psnr_80", "spike_deviance"):
         moving, still = (METRICS[metric].measure(pair) for pair in pairs)
         assert better(metric, moving, still)

@@ -60,11 +60,8 @@ def test_similarity_of_cameras_is_recovered(rig: str, seed: int) -> None:
 @given(st.integers(0, 10_000), st.integers(4, 12), st.sampled_from(["ball", "plane", "flat noise"]))
 @settings(max_examples=40, deadline=None)
 def test_umeyama_recovers_similarities_of_points(seed: int, n: int, shape: str) -> None:
-    points = np.random.default_rng(seed).normal(size=(n, 3)) * [
-        1,
-        1,
-        {"ball": 1, "plane": 0, "flat noise": 1e-9}[shape],
-    ]
+    thick = {"ball": 1, "plane": 0, "flat noise": 1e-9}[shape]
+    points = np.random.default_rng(seed).normal(size=(n, 3)) * [1, 1, thick]
     there = random_sim3(seed)
     found = umeyama(points, there(points))
     assert np.linalg.det(found.R) > 0.99
@@ -120,10 +117,8 @@ def test_shares_of_pairs_count_what_is_below_the_thresholds() -> None:
     summary = pose_errors(opposite, true).summary()
     assert summary["rra_5"] == 1
     assert summary["rta_15"] == summary["rta_5"] == summary["maa_30"] == 0
-    angle = np.radians(10.5)
-    turned = [
-        camera(c.center, Rotation.from_rotvec([0, 0, angle * (i % 2)]).as_matrix() @ c.R) for i, c in enumerate(true)
-    ]
+    turns = [Rotation.from_rotvec([0, 0, np.radians(10.5) * (i % 2)]).as_matrix() for i in range(len(true))]
+    turned = [camera(c.center, turn @ c.R) for c, turn in zip(true, turns, strict=True)]
     errors = pose_errors(turned, true)
     worst = np.maximum(errors.pair_rotation_deg, errors.pair_direction_deg)
     by_hand = np.mean([[w < k for w in worst] for k in range(1, 31)])

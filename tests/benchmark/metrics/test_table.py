@@ -96,10 +96,8 @@ def test_scene_values_are_means_of_images_and_never_pooled() -> None:
 
 def test_identical_images_are_capped_and_noted() -> None:
     truth, prediction = images()
-    per_image = {
-        "cam/000001": measure(truth, truth, EVERYWHERE, 1.0, "x"),
-        "cam/000002": measure(truth, prediction, EVERYWHERE, 1.0, "x"),
-    }
+    shown = {"cam/000001": truth, "cam/000002": prediction}
+    per_image = {name: measure(truth, image, EVERYWHERE, 1.0, "x") for name, image in shown.items()}
     assert per_image["cam/000001"]["psnr"] == MAX_PSNR_DB == per_image["cam/000001"]["psnr_dynamic"]
     assert per_image["cam/000001"]["ssim"] == pytest.approx(1)
     metrics, notes = summary(per_image)
@@ -124,11 +122,7 @@ def test_an_image_without_motion_has_no_dynamic_value_and_is_noted() -> None:
     ("prediction", "moving", "message"),
     [
         (np.zeros((24, 39)), EVERYWHERE, "expected a gray image of shape (24, 40), found shape (24, 39)"),
-        (np.zeros((24, 40, 3)), EVERYWHERE, "found shape (24, 40, 3)"),
-        (np.zeros((24, 40), np.uint8), EVERYWHERE, "expected a prediction in floating point, found uint8"),
         (np.full((24, 40), np.nan), EVERYWHERE, "expected a finite prediction, found 960 pixels that are not"),
-        (np.full((24, 40), np.inf), EVERYWHERE, "expected a finite prediction"),
-        (np.zeros((24, 40)), np.ones((24, 40)), "expected a bool mask"),
         (np.zeros((24, 40)), np.ones((24, 41), bool), "expected a bool mask"),
     ],
 )
@@ -139,12 +133,8 @@ def test_bad_images_are_refused(prediction: NDArray, moving: NDArray, message: s
 
 
 def test_the_table_describes_every_metric_once() -> None:
-    linear = [
-        f"{metric}{region}{aligned}"
-        for aligned in ("", "_aligned")
-        for region in ("", "_dynamic")
-        for metric in ("psnr", "ssim")
-    ]
+    kinds = ("", "_dynamic", "_aligned", "_dynamic_aligned")
+    linear = [f"{metric}{kind}" for kind in kinds for metric in ("psnr", "ssim")]
     shown = ["lpips_alex", "lpips_vgg", "lpips_squeeze", "flip", "brisque", "niqe", "metaiqa"]
     windows = [f"spike_psnr_{ticks}" for ticks in (5, 20, 80)]
     spikes = [f"{metric}{region}" for region in ("", "_dynamic") for metric in (*windows, "spike_deviance")]
@@ -166,9 +156,7 @@ def test_one_image_is_scored_by_every_metric_that_has_a_value() -> None:
     assert set(values) == {m.id for m in METRICS.values() if m.takes == "linear" and m.images not in without} | {"flip"}
     gain = fit_gain([(truth, prediction)])
     expected = measure(truth, prediction, region(), gain)
-    assert {k: values[k] for k in expected if k in values} == {k: v for k, v in expected.items() if k in values} | {
-        "flip": values["flip"]
-    }
+    assert {k: v for k, v in values.items() if k != "flip"} == {k: expected[k] for k in values if k != "flip"}
     without_region = score_image(truth, prediction, metrics=("psnr",))
     assert set(without_region) == {"psnr", "ssim", "psnr_aligned", "ssim_aligned"}
 

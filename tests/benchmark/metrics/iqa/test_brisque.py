@@ -130,17 +130,9 @@ def test_fits_recover_a_distribution_from_its_exact_moments(thousandths: int, le
     shape, right = thousandths / 1000, left * skew
     share = left / (left + right)  # of the values that are negative
     square, mean_abs = gamma(3 / shape) / gamma(1 / shape), gamma(2 / shape) / gamma(1 / shape)
-    count = 1000
-    sums = count * np.array(
-        [
-            mean_abs * (share * left + (1 - share) * right),
-            square * share * left**2,
-            square * (1 - share) * right**2,
-            share,
-            1 - share,
-        ]
-    )
-    fit = fit_asymmetric(sums, count)
+    squares = square * share * left**2, square * (1 - share) * right**2
+    sums = 1000 * np.array([mean_abs * (share * left + (1 - share) * right), *squares, share, 1 - share])
+    fit = fit_asymmetric(sums, 1000)
     assert float(fit.shape) == shape
     assert float(fit.left) == pytest.approx(left * math.sqrt(square), rel=1e-9)
     assert float(fit.right) == pytest.approx(right * math.sqrt(square), rel=1e-9)
