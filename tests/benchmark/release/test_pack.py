@@ -39,9 +39,8 @@ def test_the_index_says_where_every_file_lies(release_folder: Path, scene_folder
         data = (release_folder / described["shard"]).read_bytes()
         assert hashlib.sha256(data).hexdigest() == described["sha256"]
         with tarfile.open(release_folder / described["shard"]) as tar:
-            assert [(m.name, m.offset_data, m.size) for m in tar] == [
-                (f["name"], f["offset"], f["bytes"]) for f in described["files"]
-            ]
+            members = [(m.name, m.offset_data, m.size) for m in tar]
+        assert members == [(f["name"], f["offset"], f["bytes"]) for f in described["files"]]
         for f in described["files"]:
             own = data[f["offset"] : f["offset"] + f["bytes"]]
             assert hashlib.sha256(own).hexdigest() == f["sha256"]
@@ -82,9 +81,7 @@ def test_recordings_are_counted_in_the_same_scene(
     assert not (release_folder / ".counted").exists()
 
 
-def test_the_same_scenes_give_the_same_bytes(
-    release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path
-) -> None:
+def test_equal_scenes_give_equal_bytes(release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path) -> None:
     pack(open_scenes(scene_folders), tmp_path / "again", "1", 6_000_000)
     assert files_in(tmp_path / "again") == files_in(release_folder)
 
@@ -92,16 +89,11 @@ def test_the_same_scenes_give_the_same_bytes(
 def test_sums_are_those_of_sha256sum(release_folder: Path) -> None:
     done = subprocess.run(["sha256sum", "--strict", "-c", SUMS], cwd=release_folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
-    assert set(files_in(release_folder)) - {SUMS} == {line.split("  ")[1] for line in _lines(release_folder / SUMS)}
+    listed = {line.split("  ")[1] for line in (release_folder / SUMS).read_text().splitlines()}
+    assert set(files_in(release_folder)) - {SUMS} == listed
 
 
-def _lines(path: Path) -> list[str]:
-    return path.read_text().splitlines()
-
-
-def test_a_run_goes_on_where_it_was_killed(
-    release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path
-) -> None:
+def test_a_killed_run_goes_on(release_folder: Path, scene_folders: tuple[Path, ...], tmp_path: Path) -> None:
     code = (
         "import os, signal, sys; from pathlib import Path\n"
         "from spike4dgs.benchmark.release import pack, shard\n"
@@ -201,20 +193,12 @@ def test_an_emulated_array_needs_the_raw_recordings(one_full_scene: Path, tmp_pa
 
 def test_files_belong_to_the_camera_whose_whole_name_they_bear() -> None:
     cameras = ("cam", "cam.0", "cam_00.raw")
-    for path, camera in (
-        ("spikes/cam.dat", "cam"),
-        ("spikes/cam.0.dat", "cam.0"),
-        ("spikes/cam_00.raw.dat", "cam_00.raw"),
-        ("images/cam.0/000020.exr", "cam.0"),
-        ("scene.json", None),
-        ("sparse/0/cameras.bin", None),
-    ):
-        assert camera_of(path, cameras) == camera
+    assert [camera_of(f"spikes/{camera}.dat", cameras) for camera in cameras] == list(cameras)
+    paths = ("images/cam.0/000020.exr", "scene.json", "sparse/0/cameras.bin")
+    assert [camera_of(path, cameras) for path in paths] == ["cam.0", None, None]
 
 
-def test_the_working_folder_is_a_folder_too(
-    scene_folders: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_working_folder(scene_folders: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     pack(open_scenes(scene_folders), Path("."), "1", 6_000_000)
     assert (tmp_path / "release.json").is_file()

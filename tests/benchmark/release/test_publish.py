@@ -179,13 +179,10 @@ def test_a_damaged_release_is_not_sent(flat: Path, tmp_path: Path, capsys: pytes
     assert "DATASHEET.md: expected sha256" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("target", ["http://example.org/1", "ftp://example.org", "zenodo+http://example.org", "data"])
-def test_other_addresses_are_refused(target: str, release_folder: Path, release: Release) -> None:
-    with pytest.raises(UserError, match="^--to: expected"):
-        plan(release_folder, release, target)
-
-
-def test_what_zenodo_does_not_take_is_refused(release_folder: Path, release: Release) -> None:
+def test_other_addresses_and_what_zenodo_does_not_take_are_refused(release_folder: Path, release: Release) -> None:
+    for target in ("http://example.org/1", "ftp://example.org", "zenodo+http://example.org", "data"):
+        with pytest.raises(UserError, match="^--to: expected"):
+            plan(release_folder, release, target)
     with pytest.raises(UserError, match="pack it again with --flat"):
         plan(release_folder, release, "zenodo")
 

@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 from range_server import serve
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import Scene, UserError
 from spike4dgs.benchmark.release import source as source_module
 from spike4dgs.benchmark.release.index import Release
 from spike4dgs.benchmark.release.scenes import track_folders
 from spike4dgs.benchmark.release.selection import Selection
-from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.cli import download as command
 
 
@@ -56,9 +55,7 @@ def test_another_revision_is_refused(
         track_folders({"moon-0": "11"}, tmp_path / "new", str(release_folder), never)
 
 
-def test_without_a_server_the_scenes_are_named(
-    revisions: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_server_names_the_scenes(revisions: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(source_module.VARIABLE, raising=False)
     with pytest.raises(UserError, match="a release with pattern-0, pattern-1, found none; there is no public server"):
         track_folders(revisions, tmp_path, None, never)

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.release import wheel
 from spike4dgs.benchmark.release.index import Release
 from spike4dgs.benchmark.release.wheel import write_wheel
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
 
 
