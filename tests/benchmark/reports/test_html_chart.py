@@ -63,11 +63,7 @@ def test_a_logarithmic_axis_is_proportional_to_the_logarithm_and_shows_zeros_apa
     assert scale.at(0.0) == 0.0 and scale.at(1e-4) > 0.05
     assert math.isclose(scale.at(1.0) - scale.at(1e-2), scale.at(1e-2) - scale.at(1e-4))
     assert scale.ticks()[0] == 0.0
-
-
-def test_an_axis_of_zeros_alone_is_linear() -> None:
-    assert scale_of([0.0, 0.0], log=True).at(0.0) == 0.0
-    assert scale_of([2.0], log=False).at(0.0) == 0.0
+    assert scale_of([0.0, 0.0], log=True).at(0.0) == scale_of([2.0], log=False).at(0.0) == 0.0, "as a linear one"
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,8 @@ from PIL import Image
 from run_command import run_benchmark
 from small_scenes import write_small_scene
 
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import find_methods
+from spike4dgs.benchmark import METRICS, Scene, UserError, find_methods, open_scene
 from spike4dgs.benchmark.metrics.iqa.brisque import brisque
-from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import blocks_of
 from spike4dgs.benchmark.reports.paper_files import to_csv, to_latex, to_markdown, write_table
 from spike4dgs.benchmark.reports.paper_tables import (
@@ -35,7 +33,6 @@ from spike4dgs.benchmark.reports.paper_tables import (
 )
 from spike4dgs.benchmark.runs.record import COSTS
 from spike4dgs.benchmark.scene.images import encode_srgb
-from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.cli import run_benchmark as run_command
 
 
@@ -133,12 +130,8 @@ def test_every_cell_is_a_number_or_a_reason(table: dict[str, Any]) -> None:
     assert cell["values"]["psnr"]["published"] == 25.38
     assert rows["mine"]["mean"]["psnr"]["published"] is None
     assert rows["dy-spikenerf"]["mean"]["psnr"]["rank"] is None
-    assert rows["tfi+4dgs"]["mean"]["psnr"] | {"value": 0} == {
-        "value": 0,
-        "published": pytest.approx(26.002),
-        "rank": 1,
-        "published_rank": 1,
-    }
+    mean = {"published": pytest.approx(26.002), "rank": 1, "published_rank": 1}
+    assert rows["tfi+4dgs"]["mean"]["psnr"].items() >= mean.items()
 
 
 def test_refined_rows_take_no_rank_from_others(small_scene: Path, tmp_path: Path) -> None:
@@ -167,13 +160,11 @@ def test_refined_rows_have_no_mark(small_scene: Path, tmp_path: Path) -> None:
 def test_costs_of_a_row_with_a_failed_scene_are_no_means_of_the_others(table: dict[str, Any]) -> None:
     rows = {row["method"]: row for row in table["rows"]}
     assert rows["tfi+4dgs"]["costs"]["fit_seconds"] is not None
-    (record,) = [{"method": {"name": "tfi+4dgs"}, "scenes": {}, "mean": dict.fromkeys(METRICS)}]
     cell = {"metrics": dict.fromkeys(METRICS), "notes": {}, "error": "e", "status": "ok", **dict.fromkeys(COSTS, 40.0)}
     failed = {**cell, "status": "failed", **dict.fromkeys(COSTS)}
-    record["scenes"] = {"a": cell, "b": failed}
-    content = build_table(
-        published(1), [{**record, "dataset": {}, "harness": {}, "environment": {}}], {"a": "car", "b": "van"}
-    )
+    record = {"method": {"name": "tfi+4dgs"}, "scenes": {"a": cell, "b": failed}, "mean": dict.fromkeys(METRICS)}
+    record |= {"dataset": {}, "harness": {}, "environment": {}}
+    content = build_table(published(1), [record], {"a": "car", "b": "van"})
     assert content["rows"][0]["costs"] == dict.fromkeys(COSTS)
 
 
@@ -223,9 +214,8 @@ def test_best_and_second_are_marked() -> None:
         values = {"psnr": cell(psnr), "niqe": cell(niqe)}
         mean = {m: {**c, "rank": None, "published_rank": None} for m, c in values.items()}
         costs = dict.fromkeys(("fit_seconds", "render_fps", "peak_memory_mb", "model_mb"))
-        return {"method": method, "scenes": {"s": {"status": "ok", "values": values, **costs}}, "mean": mean} | {
-            "costs": costs
-        }
+        scenes = {"s": {"status": "ok", "values": values, **costs}}
+        return {"method": method, "scenes": scenes, "mean": mean, "costs": costs}
 
     table = {
         "table": 1,
@@ -262,9 +252,7 @@ def test_missing_scenes_name_the_command_that_makes_them(tmp_path: Path) -> None
     (tmp_path / "car-0-small").mkdir()
     with pytest.raises(UserError, match=r"no jaywalk-0-small, .*make-dataset jaywalk bicycle motor car van --profile"):
         table_scenes(published(1), tmp_path, "small")
-    with pytest.raises(
-        UserError, match=r"--table: expected 1 \(.*7 \(.*found 6; .*`spike4dgs speed images` makes table 6"
-    ):
+    with pytest.raises(UserError, match=r"--table: expected 1 \(.*7 \(.*found 6; .*`spike4dgs speed images` makes"):
         published(6)
 
 
@@ -313,17 +301,12 @@ def test_a_track_belongs_to_tables_1_and_2(number: int | None, tmp_path: Path) -
 
 def seen_as(scene: Scene, split: str) -> Scene:
     """The scene, with its split views-3 under another name."""
-    return replace(
-        scene,
-        meta=scene.meta | {"splits": scene.meta["splits"] | {split: scene.meta["splits"]["views-3"]}},
-        split=split,
-    )
+    splits = scene.meta["splits"]
+    return replace(scene, meta=scene.meta | {"splits": splits | {split: splits["views-3"]}}, split=split)
 
 
 @pytest.mark.usefixtures("no_images")
-def test_a_table_over_splits_runs_each_and_puts_them_side_by_side(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_table_over_splits_runs_each_and_joins_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, out = write_small_scene(tmp_path / "scene", splits=True), tmp_path / "out"
     scenes = {name: seen_as(open_scene(path), name) for name in ("views-3", "views-4")}
     table = replace(published(5), splits=tuple(scenes))

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from dummy_methods import CountMethod, run
 from matplotlib import colormaps
 from rich.console import Console
@@ -34,14 +33,11 @@ def test_levels_give_the_error_back() -> None:
     assert error_levels(np.ones((1, 1), np.float32), np.zeros((1, 1), np.float32)) == 255
 
 
-@pytest.mark.parametrize(("share", "scale"), [(0.015, 0.03), (0.03, 0.1)])
-def test_a_scale_leaves_out_two_percent_at_most(share: float, scale: float) -> None:
-    errors = np.full(1000, 0.02, np.float32)
-    errors[: int(1000 * share)] = 0.08
-    assert choose_scale([errors[:400], errors[400:]]) == scale
-
-
-def test_errors_beyond_every_scale_have_the_widest_and_scales_have_names() -> None:
+def test_a_scale_leaves_out_two_percent_at_most_and_has_a_name() -> None:
+    for share, scale in ((0.015, 0.03), (0.03, 0.1)):
+        errors = np.full(1000, 0.02, np.float32)
+        errors[: int(1000 * share)] = 0.08
+        assert choose_scale([errors[:400], errors[400:]]) == scale
     assert choose_scale([np.ones(10, np.float32)]) == 0.3 and choose_scale([np.zeros(10, np.float32)]) == 0.01
     assert choose_scale([]) == 0.3
     names = [scale_name(s) for s in (0.3, 0.1, 0.03, 0.01)]

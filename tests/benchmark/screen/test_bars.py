@@ -82,14 +82,10 @@ def run_cells(monkeypatch, cells: list[tuple[str, float, bool]], typical_s=None)
 
 
 def test_cells_left_take_as_long_as_those_of_their_method(monkeypatch) -> None:
-    cells = [
-        ("quick", 2.0, True),
-        ("slow", 90.0, True),
-        ("quick", 2.0, True),
-        ("slow", 90.0, True),
-        ("slow", 90.0, True),
-    ]
-    assert run_cells(monkeypatch, cells) == [8.0, 182.0, 180.0, 90.0]
+    quick, slow = ("quick", 2.0, True), ("slow", 90.0, True)
+    assert run_cells(monkeypatch, [quick, slow, quick, slow, slow]) == [8.0, 182.0, 180.0, 90.0]
+    kept, fitted = ("a", 0.1, False), ("a", 60.0, True)
+    assert run_cells(monkeypatch, [kept, kept, fitted, fitted, fitted])[2:] == [120.0, 60.0], "what is kept is no guide"
 
 
 def test_cells_of_other_methods_take_what_their_typical_seconds_say(monkeypatch) -> None:
@@ -119,11 +115,6 @@ def test_a_cell_of_a_known_method_does_not_end_with_its_stage(monkeypatch) -> No
             assert shown.left() == 48.0  # two steps of a stage are left, and the rest of the fit
 
 
-def test_what_is_kept_makes_no_estimate_shorter(monkeypatch) -> None:
-    cells = [("a", 0.1, False), ("a", 0.1, False), ("a", 60.0, True), ("a", 60.0, True), ("a", 60.0, True)]
-    assert run_cells(monkeypatch, cells)[2:] == [120.0, 60.0]
-
-
 def test_a_terminal_has_bars_and_a_file_has_none() -> None:
     assert make_bars(Console(file=io.StringIO())).disable
     assert not make_bars(Console(file=io.StringIO(), force_terminal=True)).disable
@@ -131,14 +122,8 @@ def test_a_terminal_has_bars_and_a_file_has_none() -> None:
 
 def test_a_notebook_has_bars_of_html(monkeypatch) -> None:
     pytest.importorskip("IPython")
-    shown: list[str] = []
-
-    class Handle:
-        def update(self, html) -> None:
-            shown.append(html.data)
-
-    made = NotebookBars(console=Console(file=io.StringIO()))
-    made._handle = Handle()
+    made, shown = NotebookBars(console=Console(file=io.StringIO())), []
+    made._handle = types.SimpleNamespace(update=lambda html: shown.append(html.data))
     monkeypatch.setattr(bars, "_NOTEBOOK_EVERY_S", 0.0)
     task = made.add_task("images of <car>", total=8)
     made.update(task, completed=2)
@@ -149,13 +134,12 @@ def test_a_notebook_has_bars_of_html(monkeypatch) -> None:
 def test_a_fit_in_a_notebook_shows_one_bar_that_ends_full(monkeypatch) -> None:
     shown: list[str] = []
 
-    class Handle:
-        def update(self, html) -> None:
-            shown.append(html.data)
-
-    def display(html, display_id) -> Handle:
+    def update(html) -> None:
         shown.append(html.data)
-        return Handle()
+
+    def display(html, display_id):
+        update(html)
+        return types.SimpleNamespace(update=update)
 
     fake = types.SimpleNamespace(HTML=lambda data: types.SimpleNamespace(data=data), display=display)
     monkeypatch.setattr(fit_progress, "in_notebook", lambda: True)

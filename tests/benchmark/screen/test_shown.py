@@ -15,14 +15,10 @@ import pytest
 from dummy_methods import CountMethod, run
 from PIL import Image
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import Scene, UserError, open_scene, open_stream, read_record, score_predictions
 from spike4dgs.benchmark.method import FitRequest, find_methods
 from spike4dgs.benchmark.runs.predictions import open_predictions, write_predictions
-from spike4dgs.benchmark.runs.record import read_record
-from spike4dgs.benchmark.runs.score import score_predictions
-from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.screen.shown import MOST, Table
-from spike4dgs.benchmark.spikes.stream import open_stream
 
 ROOMS = ("benchmark", "generators", "method", "baselines", "leaderboard")
 
