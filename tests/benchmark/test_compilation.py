@@ -146,9 +146,7 @@ def test_a_kernel_is_compiled_anew_where_an_intrinsic_writes_other_code(kernel_f
 
 
 @pytest.mark.parametrize("kernel", [hexplane_cpu._forward, mlp_cpu._forward], ids=["hexplane", "mlp"])
-def test_kernels_depend_on_the_file_that_builds_their_vectors(
-    kernel: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_depend_on_their_vectors_file(kernel: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = parts_digest(kernel._function)
     assert parts_digest(kernel._function) == before
     changed = tmp_path / "vector_ir.py"

@@ -13,10 +13,8 @@ import torch
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.benchmark import environment, plugins
+from spike4dgs.benchmark import Recipe, UserError, environment, find_methods, plugins
 from spike4dgs.benchmark.environment import Missing, choose_device, missing_rasterizer
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Recipe, find_methods
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
 from spike4dgs.method.fit import RecipeMethod
@@ -64,10 +62,8 @@ def test_asking_for_the_gpu_without_kernels_is_one_error_before_any_fit(
     out = tmp_path / "out"
     arguments = ["run-benchmark", str(small_scene), "--methods", "tfp+static", "--device", "cuda", "--out", str(out)]
     assert main(arguments) == 2 and not out.exists()
-    assert capsys.readouterr().err == (
-        "error: --device cuda: expected the package numba-cuda, found none; pip install 'spike4dgs[cuda]'; or use "
-        "--device cpu\n"
-    )
+    error = "error: --device cuda: expected the package numba-cuda, found none; pip install 'spike4dgs[cuda]'; or use "
+    assert capsys.readouterr().err == f"{error}--device cpu\n"
 
 
 @pytest.mark.usefixtures("claims")
@@ -143,9 +139,7 @@ def test_each_part_that_rendering_needs_is_named(monkeypatch: pytest.MonkeyPatch
         ("11.8", "12.9.4", "install a PyTorch for CUDA 12 from pytorch.org"),
     ],
 )
-def test_two_versions_of_cuda_in_one_process_are_refused(
-    pytorch: str, bindings: str, fix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_cuda_versions_are_refused(pytorch: str, bindings: str, fix: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.version, "cuda", pytorch)
     monkeypatch.setattr(environment, "installed_version", {"cuda-bindings": bindings}.get)
     missing = missing_rasterizer()

@@ -10,13 +10,11 @@ from types import SimpleNamespace
 import pytest
 from dummy_methods import CountMethod, run
 
+from spike4dgs.benchmark import UserError, open_scene, plugins
 from spike4dgs.benchmark import method as recipes
-from spike4dgs.benchmark import plugins
-from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.predictions import read_info
-from spike4dgs.benchmark.scene.scene import open_scene
 
 
 def register(monkeypatch: pytest.MonkeyPatch, *names: str, load: Callable[[], dict[str, CountMethod]]) -> None:
