@@ -50,10 +50,6 @@ def test_the_shell_can_read_its_script(shell: str, scripts: dict[str, str], tmp_
     if not (program := shutil.which(shell)):
         pytest.skip(f"no {shell} here")
     (tmp_path / "script").write_text(scripts[shell])
-    done = subprocess.run(
-        [program, "-n", str(tmp_path / "script")],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"HOME": str(tmp_path)},
-    )
+    command, home = [program, "-n", str(tmp_path / "script")], {"HOME": str(tmp_path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | home)
     assert done.returncode == 0 and not done.stderr

@@ -42,12 +42,8 @@ def fail(error: Exception) -> Any:
 
 
 def test_on_a_machine_without_llvm_it_names_the_scalar_variant_and_what_mends_it(tmp_path: Path) -> None:
-    environment = os.environ | {
-        "DRJIT_LIBLLVM_PATH": "/nonexistent",
-        "XDG_CACHE_HOME": str(tmp_path),
-        "COLUMNS": "80",
-        "SPIKE4DGS_DUST3R": "",
-    }
+    environment = os.environ | {"DRJIT_LIBLLVM_PATH": "/nonexistent", "XDG_CACHE_HOME": str(tmp_path)}
+    environment |= {"COLUMNS": "80", "SPIKE4DGS_DUST3R": ""}
     environment.pop("SPIKE4DGS_MITSUBA_VARIANT", None)
     done = subprocess.run(
         [sys.executable, "-m", "spike4dgs.cli", "doctor"], capture_output=True, text=True, env=environment
@@ -92,9 +88,7 @@ def test_the_weights_that_users_bring_may_be_missing_and_a_damaged_file_is_broke
     assert "Broken: X. Optional parts missing: 1." in capsys.readouterr().out
 
 
-def test_a_check_that_fails_is_a_finding_and_the_others_run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failing_check_stops_no_other(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     lanes = partial(fail, ImportError("no module numba\nmore"))
     monkeypatch.setattr("spike4dgs.method.splat.kernels.vector_ir.host_lanes", lanes)
     findings = examine()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from range_server import Behaviour, serve
@@ -62,20 +63,14 @@ def test_weights_go_where_they_are_looked_for(server: Path, hub: Path, capsys: p
 def test_licences_are_asked_for_first(
     server: Path, hub: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-
-    def ctrl_d(prompt: str) -> str:
-        raise EOFError
-
     with serve(server) as (address, seen):
         with pytest.raises(UserError, match="licences: expected your consent .*; add --yes to accept them"):
             command("lpips", source=address)
         monkeypatch.setattr(command_module.sys.stdin, "isatty", lambda: True, raising=False)
-        monkeypatch.setattr("builtins.input", lambda prompt: "no")
-        with pytest.raises(UserError, match="your consent"):
-            command("lpips", source=address)
-        monkeypatch.setattr("builtins.input", ctrl_d)
-        with pytest.raises(UserError, match="your consent"):
-            command("lpips", source=address)
+        for answer in (Mock(return_value="no"), Mock(side_effect=EOFError)):  # the latter of Ctrl+D
+            monkeypatch.setattr("builtins.input", answer)
+            with pytest.raises(UserError, match="your consent"):
+                command("lpips", source=address)
         assert not seen.requests and not hub.exists()
         monkeypatch.setattr("builtins.input", lambda prompt: "Y")
         assert command("lpips", source=address) == 0

@@ -13,12 +13,11 @@ from small_scenes import GAIN, HEIGHT, TICKS, WIDTH, add_gap, lose_ticks, shared
 
 from spike4dgs.baselines.images.published.makers import MAKERS
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.exchange.dat import import_dat
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_png
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.stream import open_stream, pack
 from spike4dgs.cli import main
 from spike4dgs.method.images import clip_images
@@ -44,10 +43,8 @@ def frames(path: Path) -> list[np.ndarray]:
 def test_every_maker_makes_the_images_of_a_dat_file(dat: Path, tmp_path: Path, method: str) -> None:
     out = tmp_path / "out"
     assert main(["images", str(dat), *SIZE, "--method", method, "--every", "40", "--out", str(out)]) == 0
-    assert sorted(p.name for p in (out / "clip").iterdir()) == [
-        *("000000.exr", "000000.png", "000040.exr", "000040.png"),
-        "images.json",
-    ]
+    made = ["000000.exr", "000000.png", "000040.exr", "000040.png", "images.json"]
+    assert sorted(p.name for p in (out / "clip").iterdir()) == made
     stream = open_stream(dat, WIDTH, HEIGHT, 2e4)
     white = float(np.percentile(stream.window(0, TICKS).mean(axis=0), 99))
     expected = IMAGES[method](stream, [40], white)[0]
@@ -90,9 +87,7 @@ def test_a_folder_of_streams(dat: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out/clip/000040.png").is_file()
 
 
-def test_what_is_finished_is_kept_and_nothing_is_overwritten(
-    dat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_finished_is_kept_as_it_is(dat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["images", str(dat), *SIZE, "--out", str(tmp_path / "out")]
     assert main(arguments) == 0
     before = {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in (tmp_path / "out").rglob("*.*")}
@@ -146,9 +141,7 @@ def test_a_stopped_run_goes_on(dat: Path, tmp_path: Path, monkeypatch: pytest.Mo
         assert (out / whole.relative_to(tmp_path / "whole")).read_bytes() == whole.read_bytes()
 
 
-def test_images_at_missing_ticks_are_left_out(
-    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_images_at_lost_ticks_are_absent(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     add_gap(small_scene, "cam_01", 35, 10)
     arguments = ["images", str(small_scene), "--camera", "cam_01", "--out", str(tmp_path / "out")]
     assert main(arguments) == 2
@@ -196,9 +189,8 @@ def test_a_network_without_weights_says_what_it_needs(
     monkeypatch.setenv("SPIKE4DGS_IMAGES", str(tmp_path / "absent.safetensors"))
     assert main(["images", str(dat), *SIZE, "--method", "msdi", "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
-    assert (
-        "expected weights of the image network" in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
-    )
+    assert "expected weights of the image network" in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("method", ["adaptive", "intervals", "msdi", "tfi"])

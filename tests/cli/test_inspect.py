@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 from small_scenes import shared_file
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.exchange.streams import DatFile
 from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.calibration import Recordings
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings, isolated
-from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream, pack
+from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 from spike4dgs.cli import main
 from spike4dgs.cli.inspect import examine, inspect
 
@@ -41,7 +41,9 @@ def stream_of(fired: np.ndarray) -> SpikeStream:
 
 
 def test_bad_pixels_are_found_and_no_others() -> None:
-    report = examine("made", stream_of(steady()))
+    fired = steady()
+    report = examine("made", stream_of(fired))
+    np.testing.assert_allclose(report.rate, fired.mean(axis=0), atol=1e-12)
     assert sorted(map(tuple, np.argwhere(report.bad.dead))) == [(5, 7), (20, 30)]
     assert list(map(tuple, np.argwhere(report.bad.hot))) == [(11, 13)]
 
@@ -84,11 +86,6 @@ def test_recordings_tell_bad_pixels_where_there_are_some() -> None:
         from_recordings(ideal(light_rate * 0), ideal(dark_rate))
 
 
-def test_rates_equal_the_unpacked_mean() -> None:
-    fired = steady()
-    np.testing.assert_allclose(examine("made", stream_of(fired)).rate, fired.mean(axis=0), atol=1e-12)
-
-
 def test_steady_light_leaves_two_adjacent_intervals_and_random_spikes_do_not() -> None:
     assert examine("steady", stream_of(steady())).two_intervals == 1
     noise = np.random.default_rng(1).random((400, 24, 40)) < 0.25
@@ -97,8 +94,7 @@ def test_steady_light_leaves_two_adjacent_intervals_and_random_spikes_do_not() -
 
 def test_a_raw_stream_becomes_an_upright_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fired = np.random.default_rng(2).random((60, 24, 40)) < np.where(np.arange(24) < 12, 0.6, 0.05)[:, None]
-    with SpikeWriter(tmp_path / "top.dat", 40, 24) as writer:
-        writer.write(pack(fired))
+    pack(fired).tofile(tmp_path / "top.dat")
     assert inspect(tmp_path / "top.dat", dat_file=DatFile(40, 24, 20_000), out=tmp_path / "out") == 0
     with Image.open(tmp_path / "out" / "top" / "top.png") as png:
         image = np.asarray(png.convert("L"), np.float64)
@@ -142,11 +138,7 @@ def test_the_table_is_whole_in_a_pipe_and_in_a_file(
     ],
 )
 def test_bad_input_is_one_line(
-    arguments: list[str],
-    message: str,
-    small_scene: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str, small_scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     monkeypatch.chdir(small_scene.parent)
     Path("short.dat").write_bytes(bytes(121))
@@ -174,8 +166,7 @@ def test_the_real_recording_is_upright_and_of_the_known_rate() -> None:
 @pytest.mark.filterwarnings("error")
 def test_extreme_sizes_are_shown_without_warnings(tmp_path: Path, width: int, height: int) -> None:
     fired = np.random.default_rng(0).random((60, height, width)) < 0.3
-    with SpikeWriter(tmp_path / "s.dat", width, height) as writer:
-        writer.write(pack(fired))
+    pack(fired).tofile(tmp_path / "s.dat")
     assert inspect(tmp_path / "s.dat", dat_file=DatFile(width, height, 20_000.0), out=tmp_path / "out") == 0
     assert (tmp_path / "out/s/s.png").is_file()
 
@@ -188,7 +179,6 @@ def test_a_training_part_shows_the_cameras_that_it_has(small_scene: Path, tmp_pa
 
 
 def test_a_camera_without_a_spike_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with SpikeWriter(tmp_path / "dark.dat", 40, 24) as writer:
-        writer.write(np.zeros((60, 120), np.uint8))
+    (tmp_path / "dark.dat").write_bytes(bytes(60 * 120))
     assert inspect(tmp_path / "dark.dat", dat_file=DatFile(40, 24, 20_000.0), out=tmp_path / "out") == 0
     assert "dark: no spike in the whole clip" in capsys.readouterr().out

@@ -10,8 +10,7 @@ from dummy_methods import CountMethod
 from rich.console import Console
 
 from spike4dgs.baselines.recipes import POSED, RECIPES
-from spike4dgs.benchmark import plugins
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import UserError, plugins
 from spike4dgs.benchmark.method import find_methods, get_method, with_settings
 from spike4dgs.benchmark.runs.record import check_method_name
 from spike4dgs.benchmark.runs.refinement import SUFFIX
@@ -56,9 +55,7 @@ def test_descriptions_tell_methods_apart() -> None:
     assert "description" not in METHODS["tfp+4dgs"].params, "words are no part of the key that a run resumes by"
 
 
-def test_a_method_of_another_package_is_named_with_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_other_packages_are_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     package = SimpleNamespace(name="theirs", version="2.1")
     entry = SimpleNamespace(name="a", value="a:M", dist=package, load=lambda: {"counts": CountMethod()})
     monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])

@@ -21,10 +21,8 @@ from PIL import Image
 from run_command import run_benchmark
 from small_scenes import write_small_scene
 
-from spike4dgs.benchmark import plugins
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import UserError, open_scene, plugins
 from spike4dgs.benchmark.reports import benchmark
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
 from spike4dgs.cli import run_benchmark as command
 from spike4dgs.leaderboard.page.rows import run_records
@@ -44,9 +42,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_run_benchmark_leaves_results_images_and_entries(
-    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_images_and_entries_stay(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     code = run_benchmark((small_scene,), methods=("counts", "quick+counts"), out=out, device="cpu", budget="0.5")
     assert code == 0
@@ -209,18 +205,10 @@ def test_a_method_that_opens_the_held_out_stream_fails_unless_fits_are_in_proces
 def test_another_record_in_a_shared_leaderboard_needs_replace(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    options = {"methods": ("quick+counts",), "device": "cpu", "metrics": ("psnr",), "leaderboard": tmp_path / "board"}
+
     def go(seed: int, budget: str = "quick", replace: bool = False) -> int:
-        return run_here(
-            (small_scene,),
-            methods=("quick+counts",),
-            out=tmp_path / "out",
-            seed=seed,
-            device="cpu",
-            budget=budget,
-            metrics=("psnr",),
-            leaderboard=tmp_path / "board",
-            replace=replace,
-        )
+        return run_here((small_scene,), out=tmp_path / "out", seed=seed, budget=budget, replace=replace, **options)
 
     assert go(0) == 0 and go(0) == 0
     assert go(1) == 0, "another seed has an entry of its own"
@@ -245,9 +233,7 @@ def test_another_record_in_a_shared_leaderboard_needs_replace(
         ({"scenes": (Path("nowhere"),)}, "nowhere: expected a scene folder, found no such folder"),
     ],
 )
-def test_bad_arguments_are_user_errors(
-    small_scene: Path, tmp_path: Path, arguments: dict[str, Any], message: str
-) -> None:
+def test_bad_arguments_are_refused(small_scene: Path, tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError) as e:
         run_benchmark(**{"scenes": (small_scene,), "out": tmp_path / "out", **arguments})
     assert message in str(e.value)
@@ -275,8 +261,6 @@ def test_a_track_is_a_mode_of_its_own(small_scene: Path, tmp_path: Path, monkeyp
         (["scene", "--data", "elsewhere"], "--data: expected --table or --track beside it, found none"),
     ],
 )
-def test_options_that_would_do_nothing_are_refused(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_useless_options_are_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run-benchmark", *arguments]) == 2
     assert message in capsys.readouterr().err
