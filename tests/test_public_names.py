@@ -63,12 +63,3 @@ def test_opening_a_scene_needs_no_torch_and_no_mitsuba() -> None:
     code = "import sys; from spike4dgs.benchmark import open_scene; print({'torch', 'mitsuba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "set()", done.stdout + done.stderr
-
-
-def test_an_unknown_name_is_an_attribute_error() -> None:
-    import spike4dgs.benchmark as benchmark
-
-    with pytest.raises(AttributeError, match="module 'spike4dgs.benchmark' has no attribute 'nonsense'"):
-        benchmark.nonsense  # noqa: B018
-    with pytest.raises(ImportError):
-        from spike4dgs.benchmark import nonsense  # noqa: F401

@@ -57,10 +57,8 @@ def spikecv_source(inputs: Path, homes: Path, env: dict[str, str]) -> tuple[str,
         raise Skipped(f"SPIKECV={checkout} is no checkout of {_SPIKECV}")
     head = subprocess.run(["git", "-C", str(checkout), "rev-parse", "HEAD"], capture_output=True, text=True)
     ours.add_sample(inputs, checkout)
-    return f"0.1a, commit {head.stdout[:7] or 'unknown'}", {
-        **env,
-        "PYTHONPATH": f"{checkout}{os.pathsep}{env['PYTHONPATH']}",
-    }
+    path = f"{checkout}{os.pathsep}{env['PYTHONPATH']}"
+    return f"0.1a, commit {head.stdout[:7] or 'unknown'}", {**env, "PYTHONPATH": path}
 
 
 def _clone(source: Path, env: dict[str, str]) -> Path:
@@ -139,13 +137,7 @@ CLIENTS = (
         for version in ("4.2.1", "3.11.1")
     ),
     Client(
-        "gsply",
-        "0.4.6",
-        "the files of `export-ply`",
-        "read_gsply.py",
-        ours.splats,
-        _SPLATS,
-        packages=("gsply==0.4.6",),
+        "gsply", "0.4.6", "the files of `export-ply`", "read_gsply.py", ours.splats, _SPLATS, packages=("gsply==0.4.6",)
     ),
     Client(
         "fourdgs",

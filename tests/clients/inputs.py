@@ -22,12 +22,11 @@ from saved_models import model, provenance
 from small_scenes import write_small_scene
 
 from spike4dgs.baselines.images.table import IMAGES
+from spike4dgs.benchmark import METRICS, Scene, Target, open_scene
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import import_spikecv
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
-from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.scene.images import encode_srgb
-from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.spikes.stream import pack
 from spike4dgs.cli import main
 from spike4dgs.method.models.saved_model import load_model
@@ -85,10 +84,8 @@ def spikezoo(root: Path) -> Values:
     """Return a camera's spikes, and the mean of the 41 around the middle of the clip."""
     stream = open_scene(root / "scene").stream("cam_01")
     middle = stream.n_ticks // 2
-    return {
-        "spikes": listed(stream.window(0, stream.n_ticks)),
-        "tfp": listed(stream.counts(middle - 20, middle + 21) / 41),
-    }
+    mean = stream.counts(middle - 20, middle + 21) / 41
+    return {"spikes": listed(stream.window(0, stream.n_ticks)), "tfp": listed(mean)}
 
 
 def d_nerf(root: Path) -> Values:
@@ -109,10 +106,8 @@ def nerfbaselines(root: Path) -> Values:
     """Return where points are seen in the training images, and the images' means."""
     scene, points = open_scene(root / "scene"), np.load(root / "points.npy")
     targets = [target for _, target in exported(root, "train")]
-    return {
-        "points": listed([scene.cameras[t.camera].project(points)[0] for t in targets]),
-        "images": [from_spikes(scene, t).mean() for t in targets],
-    }
+    seen = [scene.cameras[t.camera].project(points)[0] for t in targets]
+    return {"points": listed(seen), "images": [from_spikes(scene, t).mean() for t in targets]}
 
 
 def colmap(root: Path) -> Values:
