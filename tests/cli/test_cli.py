@@ -209,9 +209,9 @@ def test_a_bad_number_of_threads_is_said_before_openmp_reads_it() -> None:
 
 
 SEEDED = (
-    "board-clip, fault-table, fit, import-frames, make-dataset, make-msdi-data, patterns, poses, record, run- "
-    "benchmark, season make, season predict, train-msdi, train-spk2img, worlds, report dark-points, report dark- "
-    "poses, report hard-cases, report modality, report oracle-ladder, report realism, report speed-error, report "
+    "board-clip, fault-table, fit, import-frames, make-dataset, make-msdi-data, patterns, poses, record, "
+    "run-benchmark, season make, season predict, train-msdi, train-spk2img, worlds, report dark-points, report "
+    "dark-poses, report hard-cases, report modality, report oracle-ladder, report realism, report speed-error, report "
     "tuning"
 )
 
