@@ -1,7 +1,5 @@
 """Rows of other sensors: frames at their times, EDI, exposures by rendering, and no spike in any of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

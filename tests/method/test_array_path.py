@@ -1,7 +1,5 @@
 """The path of an array in closed form: posed cameras and carried splats are the same, and a file keeps it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

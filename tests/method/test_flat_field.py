@@ -1,7 +1,5 @@
 """Images and first points corrected by the cameras' calibrations: what a perfect sensor would have given."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fits of streams that hold nothing, everything, the same thing, or too little: no NaN and no Inf anywhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Hard inputs of the losses, the motion lookup and the poses from points, each beside a float64 twin."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

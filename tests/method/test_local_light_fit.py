@@ -1,7 +1,5 @@
 """A fit of a scene that a lamp lights in part, beside one that takes the lamp's course for that of all light."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

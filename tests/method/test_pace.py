@@ -1,7 +1,5 @@
 """The pace of a clip: motion measured in images drawn in closed form, and what follows from it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

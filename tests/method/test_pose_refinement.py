@@ -1,7 +1,5 @@
 """Poses that are fitted together with the scene: the exponential, a toy world from wrong poses, and resuming."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training in float32 against a twin in float64, and from seed to seed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

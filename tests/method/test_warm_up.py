@@ -1,7 +1,5 @@
 """Warming up compiles all that a fit runs, and leaves no trace in what the fit gives."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Points in less and less light: errors of known depths, and the table of a toy world."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

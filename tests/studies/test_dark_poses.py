@@ -1,7 +1,5 @@
 """Poses in less and less light: a pair's errors, what estimators see, and the table of a toy world."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What faults of an array cost: captures, fits and scores of a tiny scene, and the table of them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -1,7 +1,5 @@
 """`doctor --gpu-receipt`: refused without a GPU in one line; all that needs no CUDA, on the CPU."""
 
-from __future__ import annotations
-
 import json
 import socket
 import tomllib

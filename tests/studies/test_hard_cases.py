@@ -1,7 +1,5 @@
 """The report on the tests of a small checkout, and the fixture that judges a case."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """`speed images`: every image maker is timed and scored; one that cannot run says why."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator
 from pathlib import Path

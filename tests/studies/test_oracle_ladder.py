@@ -1,7 +1,5 @@
 """The ladder's table: what each rung gains, from the records alone."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

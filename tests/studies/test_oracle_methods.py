@@ -1,7 +1,5 @@
 """Oracles in a world whose truth is a formula: each part that they replace is the truth, and nothing else is."""
 
-from __future__ import annotations
-
 import csv
 import pickle
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The truth that oracles are given, against what the scene folder itself says: its truth, geometry, maps and facts."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

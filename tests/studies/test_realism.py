@@ -1,7 +1,5 @@
 """The classifier of real and simulated windows against closed forms, and the study on recordings that are simulated."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 

@@ -1,7 +1,5 @@
 """`speed record`: its figures are true, and a disk that falls behind is not called sufficient."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

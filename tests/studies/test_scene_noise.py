@@ -1,7 +1,5 @@
 """The table of the noise of audited scenes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A small array of simulated cameras and a moving board, for the tests of the rig calibration."""
 
-from __future__ import annotations
-
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.recorder.rig_calibration.board_clip import array, board_pose
 

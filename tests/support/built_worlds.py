@@ -1,7 +1,5 @@
 """Worlds that are built once for all tests of a process: one takes up to half a second."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 from spike4dgs.generators.worlds import WORLDS, WorldScene

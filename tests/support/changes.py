@@ -1,7 +1,5 @@
 """Changes that tests make to files, and a folder's files as bytes, to see that nothing else changed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

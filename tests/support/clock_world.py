@@ -1,7 +1,5 @@
 """The toy world seen by cameras whose clocks differ, in closed form."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """A dask cluster of processes of this machine, as its command line starts it; run as a script, a caller of it."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

@@ -6,8 +6,6 @@ The simulator runs a block's threads as Python threads, which takes most of the 
 other. Here they are generators in one thread. They run in turns, in the order of their indices.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import sys

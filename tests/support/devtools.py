@@ -1,7 +1,5 @@
 """A browser without a window, driven by its devtools protocol: it loads a page, presses keys, takes screenshots."""
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil

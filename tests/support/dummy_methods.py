@@ -1,7 +1,5 @@
 """Small real methods for tests of the runner, and the runner's settings around them."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Emulated arrays that show a small scene, for the tests of cameras and of recordings."""
 
-from __future__ import annotations
-
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
 from spike4dgs.generators.recorder.emulation.camera import Fault

@@ -1,7 +1,5 @@
 """A server that answers as Hugging Face's hub does, for one dataset repository that is a folder here."""
 
-from __future__ import annotations
-
 import json
 from contextlib import AbstractContextManager
 from pathlib import Path

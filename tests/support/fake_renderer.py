@@ -1,7 +1,5 @@
 """A renderer without Mitsuba, and the files of a folder, for the tests of `make-dataset`."""
 
-from __future__ import annotations
-
 from functools import cache
 from types import SimpleNamespace
 

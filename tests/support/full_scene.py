@@ -1,7 +1,5 @@
 """A small scene folder that holds every kind of data: recordings of light and darkness, maps, frames, events, truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

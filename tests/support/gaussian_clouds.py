@@ -1,7 +1,5 @@
 """Gaussians of every spacetime parameter, for tests of motion models."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

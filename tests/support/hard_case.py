@@ -4,8 +4,6 @@ The marker says what is asked, the independent `twin`, and the `unit` and `toler
 `kind` is twin, seeds, resume or threads; a case with `on_device` computes on the device that the report is made for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

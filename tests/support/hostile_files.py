@@ -4,8 +4,6 @@ A reader may accept a file or raise UserError with one line. Anything else is a 
 minute of computing, a GB of memory, or a file outside the folder that it was given.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import hashlib

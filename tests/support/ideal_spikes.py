@@ -1,7 +1,5 @@
 """Spikes of ideal pixels under light that is known exactly: no noise, any rates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -4,8 +4,6 @@ Nothing here is separable, vectorised over blocks or looked up: a full 7x7 windo
 and a search of the whole grid of shapes.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """Spikes of scenes under a light that changes, without noise."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64

@@ -1,7 +1,5 @@
 """A record of the sweep, for tests of what is made of them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

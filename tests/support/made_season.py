@@ -1,7 +1,5 @@
 """A small season for tests: its public files, the maintainers' folder, and predictions of participants."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

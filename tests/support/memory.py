@@ -1,7 +1,5 @@
 """Memory that this process takes, as tests bound it."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The toy world, seen by an array that moves through it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Hostile versions of a file's bytes: damaged anywhere, or well formed with values that nobody should believe."""
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

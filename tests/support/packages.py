@@ -1,7 +1,5 @@
 """Packages of others, installed by pip into a folder of their own."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

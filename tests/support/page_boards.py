@@ -1,7 +1,5 @@
 """Boards for tests of the leaderboard's page, made without scenes or fits."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A small source scene, and a whole recording of it, for the tests of emulated and mocked cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The published packages `lpips` and torchvision with random weights, run in a process of their own."""
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys

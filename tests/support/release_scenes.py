@@ -1,7 +1,5 @@
 """Two small scenes with streams of several blocks and, in one, raw recordings of light and darkness."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

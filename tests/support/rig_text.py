@@ -1,7 +1,5 @@
 """A rig profile of two cameras as text, for tests to change; a pose for the end of a camera; and both together."""
 
-from __future__ import annotations
-
 RIG = """
 schema = "spike4dgs-rig/1"
 name = "pair"

@@ -1,7 +1,5 @@
 """`run-benchmark` with all its options as keywords."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path

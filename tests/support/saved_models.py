@@ -1,7 +1,5 @@
 """Small models of every kind, unfitted but moving, for tests of what is saved and shown."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """What a conventional camera and an event camera record of a toy world, as files and as a method is given them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A small scene with the images of some methods, the truth with a known error each, and records of their scores."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ and 1, upright and unpacked, and a tick; they return spikes per tick [H, W]. `lo
 [T, H, W] those of each pixel that are in doubt.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext

@@ -1,7 +1,5 @@
 """The slow twin of `likely_spikes`: all ticks of a train as one normal variable, its covariance written out."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

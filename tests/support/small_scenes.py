@@ -1,7 +1,5 @@
 """A small synthetic scene folder, and the optional real recordings."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A back end of the rasteriser against the float64 reference: images, and gradients of all inputs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

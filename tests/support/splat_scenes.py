@@ -1,7 +1,5 @@
 """Gaussians that are hard to render: random ones, and a scene for each way to get a rasteriser wrong, all float64."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Help for tests of the leaderboard: submit a finished run's records, change the files, make releases."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ Each submitter is a process that submits one claimed record, and is started agai
 SIGKILLs at random times after a submitter began to submit.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Files of training bursts without a renderer: the toy world in nine cameras, in the format of `make-msdi-data`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

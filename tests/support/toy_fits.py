@@ -1,7 +1,5 @@
 """Recipes on a small toy world with stand-ins for images and initialisation, for tests of the trainer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory

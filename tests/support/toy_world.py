@@ -1,7 +1,5 @@
 """A world for tests that needs no renderer: a textured floor, a wall, and a board that moves in front of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

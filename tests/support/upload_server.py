@@ -3,8 +3,6 @@
 They have what uploads use of them, after the hosts' documentation (developers.zenodo.org, git-lfs's batch interface).
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -2,8 +2,6 @@
 their own, which has the library preloaded; they are not collected otherwise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path

@@ -3,8 +3,6 @@
 For 64-bit machines; written against umockdev 0.17.
 """
 
-from __future__ import annotations
-
 import ctypes as c
 from types import SimpleNamespace
 from typing import Any

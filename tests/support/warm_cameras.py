@@ -1,7 +1,5 @@
 """Cameras whose dark rates are others than in their recordings."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from spike4dgs.benchmark.scene.calibration import Recordings

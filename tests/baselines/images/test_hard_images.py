@@ -1,7 +1,5 @@
 """Hard inputs of the image makers: no spike, one spike, all spikes, moving edges, the shortest clips."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Networks of other people: tensors, weights, what they return for known light, and images of a real recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Spk2ImgNet's windows, training data, training, weight files, and its place among the image makers."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Spk2ImgNet's parts against explicit loops, and what the network may see of its window."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

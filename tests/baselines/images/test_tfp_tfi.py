@@ -1,7 +1,5 @@
 """TFP and TFI against slow float64 twins, at the clip's ends, and against the light that made the spikes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

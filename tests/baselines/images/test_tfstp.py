@@ -1,7 +1,5 @@
 """TFSTP against its published equations in 50 digits, at rest, at the clip's ends, and against the light."""
 
-from __future__ import annotations
-
 from decimal import Decimal
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The image network's inputs, its start at `adaptive`'s image, its losses in decibels, and its training's bits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Adaptive windows against a slow twin on whole arrays, at rest, at steps of light, and at the clip's ends."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings

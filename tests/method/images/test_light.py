@@ -1,7 +1,5 @@
 """The course of the light from a clip, and images in mean light."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """A lamp beside steady light: its course, the shares of it that pixels see, and images of both layers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from lit_streams import RATE_HZ, lit

@@ -1,7 +1,5 @@
 """Images of recordings that lack ticks: against the slow twin, against whole recordings, and by their bounds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

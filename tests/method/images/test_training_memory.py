@@ -1,7 +1,5 @@
 """The memory of a fit's first steps does not grow with the clip, but for the trains of one stream."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

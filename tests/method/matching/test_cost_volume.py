@@ -1,7 +1,5 @@
 """The cost volume on features that are a function of the point: a slanted plane whose depth is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation

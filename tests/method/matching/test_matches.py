@@ -1,7 +1,5 @@
 """Matches: alignment of images whose shift is known, and SIFT's matches of a turned image."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter, shift
 

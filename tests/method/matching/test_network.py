@@ -1,7 +1,5 @@
 """The matching network: alignment of cells, sampling, dual softmax, refinement, and a pair that it must learn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Poses from matches: the derivative against differences, and arrays whose poses are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import approx_fprime

@@ -1,7 +1,5 @@
 """Motion coherence: the kernel against its float64 twin, closed forms, and what it does where nothing else pulls."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import pytest

@@ -1,7 +1,5 @@
 """The perceptron's vector code beside three layers in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The kernels of polynomial paths against plain torch in float64: values and gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

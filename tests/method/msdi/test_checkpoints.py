@@ -1,7 +1,5 @@
 """Published weights of Fast3R and DUSt3R, and MSDI's own weight files."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Inputs of MSDI's networks, and streams of larger pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The losses of MSDI's training against loops and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

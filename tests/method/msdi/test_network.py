@@ -1,7 +1,5 @@
 """MSDI's network, its extractor and its layers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Poses from points: exact, noisy, with unknown focal length, and without any solution."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

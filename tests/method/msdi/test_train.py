@@ -1,7 +1,5 @@
 """Training of MSDI at tiny size: it learns, resumes bit for bit, is scored honestly, and leaves its files behind."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """MSDI's training data: spikes against their twin and the scenes' simulator, and batches."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`fit`, end to end: recordings with and without poses, without a file of truth, and killed."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import re

@@ -1,7 +1,5 @@
 """Poses and clocks of a recording before a fit: left alone where they are right, or where the clip tells nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The survey before a fit: gaps, bad pixels and gains of a toy world that has them, against one that does not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

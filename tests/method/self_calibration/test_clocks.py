@@ -1,7 +1,5 @@
 """The clocks of an array from a clip, and their normal equations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Dark rates that changed since the calibration."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a clip tells of its cameras before a fit: right poses stay as they are, those a little off are mended."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

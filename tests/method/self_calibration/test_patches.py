@@ -1,7 +1,5 @@
 """Patches of an array's views, and images of windows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

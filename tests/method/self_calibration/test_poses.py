@@ -1,7 +1,5 @@
 """Poses near given ones, on the toy world's mean images: told to be right where they are, repaired where not."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

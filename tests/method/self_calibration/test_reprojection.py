@@ -1,7 +1,5 @@
 """Reprojection errors of marked points: exact cameras, wrong ones, and lenses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Shadings against known ones: cameras before a textured plane, some of it hidden, some of it moving."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Gaussians in front of a background against the same Gaussians rendered all at once: equal bits, equal gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings

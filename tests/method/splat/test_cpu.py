@@ -1,7 +1,5 @@
 """The CPU kernels against the float64 reference: images, gradients, determinism, errors."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable

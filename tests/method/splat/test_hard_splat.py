@@ -1,7 +1,5 @@
 """Hard scenes on the device of the report: images and gradients beside the float64 reference, and refusals."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import pytest

@@ -1,7 +1,5 @@
 """Rendering through lenses: kernels against the float64 twin, the twin against OpenCV and finite differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields
 

@@ -5,8 +5,6 @@ LLVM's compiler for ARM too, before numba's own turns it into code of this machi
 optimised, which would take long: the kernels themselves say where their vectors are.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The pixel filter against the integral over a pixel's square, which a sensor and the ground truth take."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The fused SSIM of training against its float64 twin, scikit-image and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The kernels' own threads: every item once, errors reach the caller, and nothing is called after the return."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The path of an array from its clip: right where it moves, none where it stands, and what it is worth to a fit."""
 
-from __future__ import annotations
-
 import io
 from contextlib import redirect_stderr
 from dataclasses import replace

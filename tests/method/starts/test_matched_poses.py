@@ -1,7 +1,5 @@
 """Poses that features refine: the toy world's truth, made wrong in known ways."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

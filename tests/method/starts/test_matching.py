@@ -1,7 +1,5 @@
 """Poses and points from matches of the toy world: true matches give its cameras; weights decide which network runs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The initialisations by MSDI: from what a perfect network would say of the toy world, and from random weights."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

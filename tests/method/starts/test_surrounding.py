@@ -1,7 +1,5 @@
 """First points for cameras around their subject."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """SPSS and the losses it is compared with, against neurons run tick by tick and phi_s applied to every pixel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

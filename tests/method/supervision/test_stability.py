@@ -1,7 +1,5 @@
 """Losses at the edges of what a camera records: no number in them, in their gradients or in what they train is lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, replace
 

@@ -1,7 +1,5 @@
 """Losses on spikes leave out what was not measured: bad pixels and long gaps."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The detector of changes: its variation against numpy, and the limits of its users."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

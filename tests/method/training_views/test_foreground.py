@@ -1,7 +1,5 @@
 """Foreground masks, the points in them, and the window around them, on the toy world."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Corrections of means over time against closed forms: light that is a polynomial in time."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Sequence

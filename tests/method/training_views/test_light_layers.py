@@ -1,7 +1,5 @@
 """Images in the light of a lamp: what of their changes is light, and colours of two layers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

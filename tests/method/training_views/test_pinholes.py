@@ -1,7 +1,5 @@
 """Pinholes in the place of distorted cameras: maps, images, spikes, renders, and a fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

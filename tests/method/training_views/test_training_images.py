@@ -1,7 +1,5 @@
 """What a loss sees of training images: NaN where nothing was measured at an image's time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Velocities of points on a plane with a known motion, whose images are drawn in closed form, and their Jacobians."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The files of `export-ply`, read by a reader of its own: rendered again they give the model's images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The viewer's content without a browser; then the viewer in a real one."""
 
-from __future__ import annotations
-
 import socket
 import sys
 import threading

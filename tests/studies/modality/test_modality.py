@@ -1,7 +1,5 @@
 """The table and the plot of sensors: what a camera of each sends, and what the records say."""
 
-from __future__ import annotations
-
 import csv
 import io
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables of made-up records: the whole text, ties, intervals beside SciPy, and what may not be hidden."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

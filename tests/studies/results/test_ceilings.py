@@ -1,7 +1,5 @@
 """Ceilings of scores: noise of a known size in the truth is found, where things move and elsewhere."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """The pages say what the records say, and have no more figures outside of generated blocks than they had."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

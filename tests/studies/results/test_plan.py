@@ -1,7 +1,5 @@
 """The plan has every row and cell once, what matters most first, and knowledge by recipe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

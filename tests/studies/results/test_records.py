@@ -1,7 +1,5 @@
 """Records of cells: what the schema takes, one file a row, small, and refused where they contradict each other."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The sweep: a killed one goes on where it was, failed cells are tried again, times count in quiet passes alone."""
 
-from __future__ import annotations
-
 import io
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Cycles on worlds whose light is known in closed form; skipped where `bpy` is not installed."""
 
-from __future__ import annotations
-
 import os
 import sys
 from dataclasses import replace

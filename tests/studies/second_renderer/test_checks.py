@@ -1,7 +1,5 @@
 """The changed worlds of the checks, and what is measured on their images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

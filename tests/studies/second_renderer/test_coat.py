@@ -1,7 +1,5 @@
 """The coat in closed form against Mitsuba's `roughplastic`, and against what light has to do."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

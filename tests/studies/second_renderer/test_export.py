@@ -1,7 +1,5 @@
 """What the second renderer is given: geometry, cameras and light, against other ways to find them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

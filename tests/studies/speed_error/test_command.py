@@ -1,7 +1,5 @@
 """The command itself: every room's measurements in the smallest size, on a small scene, to the page."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from spike4dgs.benchmark.metrics.table import METRICS

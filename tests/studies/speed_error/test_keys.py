@@ -1,7 +1,5 @@
 """Key-frame spacing, and the keys that the renderer's settings are compared at."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba

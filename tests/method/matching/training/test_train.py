@@ -1,7 +1,5 @@
 """Data and training of the matching network: inputs, conditions, losses that fall, and runs that go on bit by bit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

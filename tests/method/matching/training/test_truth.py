@@ -1,7 +1,5 @@
 """True correspondences against closed forms: a plane's homography, a sphere before a wall, points that are hidden."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation

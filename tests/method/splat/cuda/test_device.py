@@ -3,8 +3,6 @@
 The rasteriser is compared with the float64 reference; a path, with the same fit on the CPU.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The tiles' lists against a loop over tiles, and the CUDA back end's errors."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Every path on a pretended device: nothing mixes its tensors with those of the CPU. See `pretend_device`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The CUDA kernels in numba's simulator against the float64 reference, on any machine."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
