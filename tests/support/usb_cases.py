@@ -117,10 +117,7 @@ def test_a_camera_that_falls_silent_keeps_every_earlier_tick(two: Scene, bus: An
     ("kind", "message"),
     [
         ("missing", "expected a device with this serial number, found only the serials EMULATED0000; check cable"),
-        (
-            "duplicate serial",
-            "expected one device with this serial number, found several, at bus 1 address [34],",
-        ),
+        ("duplicate serial", "expected one device with this serial number, found several, at bus 1 address [34],"),
         ("high speed", r"expected a SuperSpeed link \(5 Gbit/s\), found High Speed \(480 Mbit/s\); use a USB 3 port"),
     ],
 )

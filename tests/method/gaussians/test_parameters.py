@@ -8,14 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.method.gaussians.optimizer import (
-    Adam,
-    Decay,
-    apply_edit,
-    export_state,
-    import_state,
-    set_learning_rates,
-)
+from spike4dgs.method.gaussians.optimizer import Adam, Decay, apply_edit, export_state, import_state, set_learning_rates
 from spike4dgs.method.gaussians.parameters import MAX_COPIES, Gaussians, densify, from_points, nearest, relocate, share
 
 RATES = {name: Decay(0.01, 0.001) for name in ("means", "log_scales", "quats", "logits", "colors")}

@@ -224,16 +224,10 @@ def without(key: str) -> Any:
             lambda f: {"config": {"motion": {**f.config["motion"], "settings": {"features": 5}}}},
             "cannot read .ValueError: .* in place of",
         ),
-        (
-            lambda f: {"config": {**f.config, "filter": {"variance": -1.0}}},
-            "ValueError: -1.0 is no number",
-        ),
+        (lambda f: {"config": {**f.config, "filter": {"variance": -1.0}}}, "ValueError: -1.0 is no number"),
         (lambda f: {"config": {**f.config, "filter": {"compensated": 1}}}, "cannot read .ValueError: a filter with"),
         (lambda f: {"config": {**f.config, "filter": {"sigma": 1.0}}}, "cannot read .TypeError"),
-        (
-            lambda f: {"tensors": {k: v for k, v in f.tensors.items() if k != "piece0.means"}},
-            "cannot read .KeyError",
-        ),
+        (lambda f: {"tensors": {k: v for k, v in f.tensors.items() if k != "piece0.means"}}, "cannot read .KeyError"),
         (lambda f: {"provenance": provenance(cameras=())}, "at cameras"),
         (lambda f: {"provenance": provenance(rate_hz=0.0)}, "at rate_hz"),
         (lambda f: {"provenance": provenance(method={})}, "at method: 'name' is a required property"),

@@ -10,13 +10,7 @@ from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.models.fitted_model import FittedModel, MotionSpec
 from spike4dgs.method.motion.base import Extent
-from spike4dgs.method.motion.hexplane import (
-    HexPlaneMotion,
-    HexPlaneSettings,
-    plane_tv,
-    time_smoothness,
-    time_sparsity,
-)
+from spike4dgs.method.motion.hexplane import HexPlaneMotion, HexPlaneSettings, plane_tv, time_smoothness, time_sparsity
 from spike4dgs.method.motion.table import Static
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import Views

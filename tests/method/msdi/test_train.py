@@ -20,13 +20,7 @@ from spike4dgs.method.msdi.evaluate import GROUPS, calibrate, evaluate, tfp
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import ALPHA
 from spike4dgs.method.msdi.records import Curve, StartWeights, model_card
-from spike4dgs.method.msdi.train import (
-    Run,
-    Training,
-    TrainingSettings,
-    checkpoint_key,
-    start_from,
-)
+from spike4dgs.method.msdi.train import Run, Training, TrainingSettings, checkpoint_key, start_from
 from spike4dgs.method.msdi.training_data import Batch, Bursts
 from spike4dgs.method.msdi.weights import WEIGHTS, Card, load_network
 

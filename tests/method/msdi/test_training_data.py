@@ -8,10 +8,7 @@ from toy_bursts import toy_burst, write_toy_shard
 from toy_world import GAIN, ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.scene.training_bursts import (
-    REACH,
-    open_folder,
-)
+from spike4dgs.benchmark.scene.training_bursts import REACH, open_folder
 from spike4dgs.benchmark.spikes.bits import unpack
 from spike4dgs.benchmark.spikes.sensor_model import THRESHOLD
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate

@@ -14,9 +14,7 @@ from spike4dgs.method.self_calibration.from_clip import as_in_clip, at_mended_po
 WORLD = ClockWorld(width=240, height=152, n_ticks=48, travel=0.1).training
 CORNERS = (0, 2, 5, 7)  # of the array: four views have six pairs, all eight have 28
 SCENE = replace(
-    WORLD,
-    cameras=tuple(WORLD.cameras[i] for i in CORNERS),
-    streams=tuple(WORLD.streams[i] for i in CORNERS),
+    WORLD, cameras=tuple(WORLD.cameras[i] for i in CORNERS), streams=tuple(WORLD.streams[i] for i in CORNERS)
 )
 
 

@@ -16,14 +16,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.starts.base import StartRequest
 from spike4dgs.method.starts.clip import window_means
-from spike4dgs.method.starts.plane_sweep import (
-    agreed,
-    find_range,
-    full_range,
-    lift,
-    plane_homographies,
-    sweep,
-)
+from spike4dgs.method.starts.plane_sweep import agreed, find_range, full_range, lift, plane_homographies, sweep
 from spike4dgs.method.starts.rig import RigSettings, middle_camera, rig
 from spike4dgs.method.starts.structure_from_motion import clip_means
 

@@ -21,16 +21,7 @@ from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.cli import main
 from spike4dgs.method.models.saved_model import SavedModel
 from spike4dgs.method.viewing.camera_paths import fixed
-from spike4dgs.method.viewing.content import (
-    BORDER,
-    MODES,
-    Content,
-    free_camera,
-    matching,
-    open_content,
-    padded,
-    window,
-)
+from spike4dgs.method.viewing.content import BORDER, MODES, Content, free_camera, matching, open_content, padded, window
 from spike4dgs.method.viewing.serving import free_port, is_own
 from spike4dgs.method.viewing.viewer import FREE, Viewer
 

@@ -17,14 +17,7 @@ COLUMNS = [
 def result(id: str, series: list[Any], **changes: Any) -> dict[str, Any]:
     texts = {"approximation": "less", "exact": "all", "reason": "it is <enough>", "held_by": "tests/x.py"}
     axes = {"x": "ms", "y": ["error"], "cost": "ms", "error": "error"}
-    made = {
-        "id": id,
-        "group": GROUP,
-        "title": f"title of {id}",
-        "columns": COLUMNS,
-        "series": series,
-        "problem": "",
-    }
+    made = {"id": id, "group": GROUP, "title": f"title of {id}", "columns": COLUMNS, "series": series, "problem": ""}
     return {**made, **texts, **axes, **changes}
 
 
@@ -57,9 +50,7 @@ def test_the_summary_compares_the_chosen_point_with_its_exact_twin(tmp_path: Pat
     usual = [{"name": "s", "points": points(("all", "exact", 90.0, 0.0), ("less", "chosen", 3.0, 2e-3))}]
     grows = [{"name": "s", "points": points(("", "", 3.0, None))}]
     html = page(tmp_path, result("a", usual), result("c", grows, exact="", x="share"))
-    assert summary_rows(html) == [
-        ["title of a", "less", "3", "90", "30", "time, ms", "0.002", "error, radiance"],
-    ]
+    assert summary_rows(html) == [["title of a", "less", "3", "90", "30", "time, ms", "0.002", "error, radiance"]]
     assert 'href="#title-of-a"' in html and 'id="title-of-a"' in html
     assert "a CPU, 2 cores" in html and "abc, with changes" in html and "it is &lt;enough&gt;" in html
 

@@ -18,13 +18,7 @@ def request(tmp_path: Path) -> Request:
 
 
 def measured(id: str, run: Any, **changes: Any) -> Measurement:
-    texts = {
-        "group": GROUP,
-        "title": f"title of {id}",
-        "approximation": "less",
-        "exact": "all",
-        "reason": "because",
-    }
+    texts = {"group": GROUP, "title": f"title of {id}", "approximation": "less", "exact": "all", "reason": "because"}
     return Measurement(id, **texts | {"columns": (MS, ERROR), "x": "ms", "y": ("error",), "run": run} | changes)
 
 

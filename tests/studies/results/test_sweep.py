@@ -265,10 +265,7 @@ def test_a_released_scene_is_known_by_the_releases_fingerprint(folder: Path, mon
             "--only: expected groups among table1, table2, .*, modality, .*, steps-quick, .*, trial, found table9",
         ),
         (Choice(only=("trial",), rows=("tfi+stg", "tfp+stg")), "--rows: expected rows among nearest-view, .*tfi.stg;"),
-        (
-            Choice(only=("trial",), scenes_of=Path("nowhere")),
-            "nowhere: expected scenes of the plan, such as car-0",
-        ),
+        (Choice(only=("trial",), scenes_of=Path("nowhere")), "nowhere: expected scenes of the plan, such as car-0"),
     ],
 )
 def test_what_is_not_there_is_named_before_anything_is_fitted(
