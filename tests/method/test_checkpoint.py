@@ -90,9 +90,7 @@ def test_a_file_that_was_cut_off_is_refused(whole: bytes, length: int, tmp_path:
         ({"schema": "spike4dgs-checkpoint/1", "fit": "fit", "step": "soon"}, "damaged data"),
     ],
 )
-def test_a_foreign_file_of_the_same_format_is_refused(
-    metadata: dict[str, str] | None, message: str, tmp_path: Path
-) -> None:
+def test_a_foreign_file_of_the_same_format_is_refused(metadata: dict[str, str] | None, message: str, tmp_path) -> None:
     path = tmp_path / "fit.safetensors"
     safetensors.torch.save_file({"x": torch.zeros(2)}, path, metadata=metadata)
     with pytest.raises(UserError, match=message):

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from toy_fits import QUICK, request
 from toy_world import ToyWorld
@@ -59,9 +58,7 @@ def check_splats(model: FittedModel) -> None:
         np.testing.assert_allclose(model.rendered(splats, views)[0].detach().clamp(min=0).numpy(), image, atol=1e-5)
 
 
-def test_each_gaussian_has_a_share_of_the_lamp_and_splats_are_lit_as_the_render(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_each_gaussian_has_a_share_of_the_lamp_and_splats_are_lit_as_the_render(capsys) -> None:
     own = fitted(apart=True)
     assert "the light of a part of the scene changes" in capsys.readouterr().err
     assert own.background.colors.shape[1] == 2 and own.light is not None

@@ -66,9 +66,7 @@ def test_estimators_see_the_light_that_there_is_without_the_pixels_pattern(shard
     assert rotation.max() < 1 and direction.max() < 5
 
 
-def test_the_table_has_shares_of_pairs_in_each_condition(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_table_has_shares_of_pairs_in_each_condition(shards: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(dark, "LIGHTS", (1.0, 1 / 4096))
     monkeypatch.setattr(dark, "TICKS", (41,))
     monkeypatch.setattr(dark, "VIEWS", 6)  # 15 pairs instead of 28

@@ -85,9 +85,7 @@ def test_captures_of_another_scene_seed_or_budget_are_not_taken_for_these(
     assert main(command) == 2 and "of this scene, found" in capsys.readouterr().err
 
 
-def test_a_fit_that_was_refused_is_tried_again(
-    tiny_data: Path, out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_fit_that_was_refused_is_tried_again(tiny_data: Path, out: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(fault_table, "CASES", CASES[:1])
     kept = out / "fits/none/tfp+static/scores.json"
     kept.unlink()
@@ -103,9 +101,7 @@ def refuse() -> None:
     raise UserError("no weights")
 
 
-def test_rows_of_the_lens_show_the_scene_that_was_made_with_it(
-    tiny_data: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_of_the_lens_show_the_scene_that_was_made_with_it(tiny_data, out: Path, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(fault_table, "CASES", CASES[:1])
     monkeypatch.setattr(fault_table, "LENS_CASES", (fault_table.LENS_CASES[-1],))
     curved = tmp_path / "curved"

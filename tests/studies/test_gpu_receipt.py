@@ -94,9 +94,7 @@ def test_operations_are_those_of_one_call() -> None:
     assert rows["aten::mm"] == 2
 
 
-def test_the_notebook_runs_commands_that_there_are_and_reads_a_receipt(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_notebook_runs_commands_that_there_are_and_reads_a_receipt(tmp_path: Path, monkeypatch, capsys) -> None:
     cells = [cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == "code"]
     sources = ["".join(cell["source"]) for cell in cells]
     assert not any(cell["outputs"] for cell in cells), "nobody has run it yet"

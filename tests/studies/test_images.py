@@ -141,9 +141,7 @@ def test_a_scene_without_ground_truth_is_refused(small_scene: Path) -> None:
         images.middle_target(scene)
 
 
-def test_gaps_are_refused_unless_allowed(
-    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_gaps_are_refused_unless_allowed(small_scene: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     add_gap(small_scene, "cam_00", 3, 2)
     use(monkeypatch, {"tfp": TFP})
     command = ["speed", "images", str(small_scene), "--out", str(tmp_path)]

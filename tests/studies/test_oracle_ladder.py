@@ -54,9 +54,7 @@ def scenes(tmp_path: Path) -> list[Path]:
     return [write_small_scene(tmp_path / f"s{i}", seed=i) for i in range(2)]
 
 
-def test_the_table_has_what_the_records_have_and_the_difference_to_the_first_rung(
-    scenes: list[Path], tmp_path: Path
-) -> None:
+def test_the_table_has_what_the_records_have_and_the_difference_to_the_first_rung(scenes: list[Path], tmp_path) -> None:
     out = tmp_path / "out"
     records = go(scenes, out, CountMethod("counts", steps=1), oracle("counts+oracle-steps", 9))
     rows = list(csv.DictReader((out / "ladder.csv").read_text().splitlines()))

@@ -206,9 +206,7 @@ def test_what_is_no_recipe_of_the_trainer_with_given_poses_has_no_ladder(root: P
 
 
 @pytest.mark.slow
-def test_the_command_climbs_the_ladder_of_a_made_scene(
-    tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_climbs_the_ladder_of_a_made_scene(tiny_data: Path, tmp_path: Path, capsys) -> None:
     scene, out = tiny_data / "car-0-tiny", tmp_path / "out"
     options = ["--samples", "16", "--budget", "0.005", "--device", "cpu", "--out", str(out)]
     assert main(["report", "oracle-ladder", str(scene), *options, "--metrics", "psnr"]) == 0
@@ -227,9 +225,7 @@ def test_the_command_climbs_the_ladder_of_a_made_scene(
     assert {p: p.stat().st_mtime_ns for p in out.rglob("prediction.json")} == kept and len(kept) == len(rows)
 
 
-def test_the_command_refuses_imported_scenes(
-    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_refuses_imported_scenes(small_scene: Path, tmp_path: Path, capsys) -> None:
     out = ["--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["report", "oracle-ladder", str(small_scene), *out]) == 2
     assert "expected a scene whose world is here, for oracles, found source 'test'" in capsys.readouterr().err

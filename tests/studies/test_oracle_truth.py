@@ -139,9 +139,7 @@ def everything(truth: Truth) -> dict[Path, tuple[int, bytes]]:
     return {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in truth.folder.rglob("*.npz")}
 
 
-def test_what_is_there_is_kept_and_what_is_missing_is_made_again_alike(
-    scene: Scene, truth: Truth, tmp_path: Path
-) -> None:
+def test_what_is_there_is_kept_and_what_is_missing_is_made_again_alike(scene: Scene, truth: Truth, tmp_path) -> None:
     copy = Truth(Path(shutil.copytree(truth.folder, tmp_path / truth.folder.name)))
     before = everything(copy)
     copy.image_file(TICKS[1]).unlink()

@@ -44,9 +44,7 @@ def test_cameras_at_one_place_are_a_row_with_a_reason(monkeypatch: pytest.Monkey
     assert row["registered"] == "8 of 8" and row["rotation_deg"] is None and "different positions" in str(row["error"])
 
 
-def test_command_prints_and_writes_the_table(
-    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_prints_and_writes_the_table(small_scene: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "poses.json"
     arguments = ["poses", str(small_scene), "--initialization", "rig", "colmap", "--images", "tfp", "--out", str(out)]
     assert main(arguments) == 0

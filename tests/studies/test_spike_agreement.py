@@ -31,9 +31,7 @@ def test_correlations_are_spearmans_and_deviances_count_backwards() -> None:
     assert correlations(scores)["spike_psnr_5"]["s"] is None, "two methods have no order to speak of"
 
 
-def test_a_run_becomes_a_table_and_a_plot(
-    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_becomes_a_table_and_a_plot(small_scene: Path, tmp_path: Path, capsys) -> None:
     data = tmp_path / "data"
     data.mkdir()
     shutil.move(small_scene, data / "pattern-0")
@@ -69,9 +67,7 @@ def test_runs_without_predictions_are_said(tmp_path: Path, capsys: pytest.Captur
     assert "expected predictions/METHOD/SCENE of scenes with ground truth" in capsys.readouterr().err
 
 
-def test_a_method_of_two_runs_and_a_folder_that_is_not_there_are_refused(
-    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_method_of_two_runs_and_a_folder_that_is_not_there_are_refused(small_scene: Path, tmp_path, capsys) -> None:
     shutil.move(small_scene, tmp_path / "pattern-0")
     run(tmp_path / "run", [tmp_path / "pattern-0"], CountMethod("fine"))
     command = ["spike-agreement", str(tmp_path / "run"), "--data", str(tmp_path), "--out", str(tmp_path / "out")]

@@ -176,9 +176,7 @@ def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(small_scene
         second.resume(tmp_path / "c.safetensors", "another key")
 
 
-def test_command_to_weights_to_images(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_to_weights_to_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     one, two = write_small_scene(tmp_path / "one", seed=1), write_small_scene(tmp_path / "two", seed=2)
     out = tmp_path / "out"
     arguments = {"scenes": (one,), "hidden": (two,), "out": out, "width": 2, "steps": 2, "compute": Compute("cpu")}

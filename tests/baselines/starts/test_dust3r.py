@@ -125,9 +125,7 @@ def test_without_weights_the_reason_names_the_file(monkeypatch: pytest.MonkeyPat
         dust3r(WORLD.training, 0)
 
 
-def test_the_whole_path_runs_from_a_file_of_tiny_random_weights(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_whole_path_runs_from_a_file_of_tiny_random_weights(monkeypatch, tmp_path: Path) -> None:
     save_file(tiny().state_dict(), tmp_path / "tiny.safetensors")
     monkeypatch.setenv("SPIKE4DGS_DUST3R", str(tmp_path / "tiny.safetensors"))
     monkeypatch.setattr(module, "load_dust3r", lambda path: load_dust3r(path, TINY))

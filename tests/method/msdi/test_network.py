@@ -329,9 +329,7 @@ def test_training_fits_one_sample() -> None:
 
 
 @pytest.mark.parametrize(("capability", "units"), [((7, 5), False), ((8, 0), True), ((12, 0), True)])
-def test_bfloat16_is_for_gpus_that_have_units_for_it(
-    capability: tuple[int, int], units: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bfloat16_is_for_gpus_that_have_units_for_it(capability: tuple[int, int], units: bool, monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
     has_bfloat16.cache_clear()
     assert has_bfloat16(torch.device("cuda", 0)) is units

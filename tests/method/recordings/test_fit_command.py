@@ -201,9 +201,7 @@ def test_no_file_of_truth_is_read(tmp_path: Path, no_sheet: None, capsys: pytest
     assert "held-out cam_03 by their own spikes: no score (not computed: the stream or the recordings of cam_03" in said
 
 
-def test_held_out_cameras_are_judged_by_their_own_spikes(
-    tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, no_sheet: None, capsys) -> None:
     bare = write_small_scene(tmp_path / "scene")
     for name in ("images", "masks"):
         shutil.rmtree(bare / name)
@@ -222,9 +220,7 @@ def test_held_out_cameras_are_judged_by_their_own_spikes(
     assert table_rows(page, "mean") == [["mean", "3", *shown]], "the mean over cameras too"
 
 
-def test_streams_without_poses_get_estimated_ones(
-    tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_streams_without_poses_get_estimated_ones(tmp_path: Path, no_sheet: None, capsys) -> None:
     write_stream_folder(tmp_path / "streams", write_streams(tmp_path / "streams"))
     out = tmp_path / "out"
     arguments = ["fit", str(tmp_path / "streams"), "--method", "tfp+4dgs", "--out", str(out), *QUICK]
@@ -277,9 +273,7 @@ def test_dark_streams_have_no_poses(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
-def test_a_second_run_makes_only_the_reports_again(
-    fitted: Path, recorded: Path, tmp_path: Path, no_sheet: None
-) -> None:
+def test_a_second_run_makes_only_the_reports_again(fitted: Path, recorded: Path, tmp_path, no_sheet: None) -> None:
     out = Path(shutil.copytree(fitted, tmp_path / "out"))
     (out / REPORT).unlink()
     before, half = (out / MODEL).stat().st_mtime_ns, leave_part(out)
@@ -288,9 +282,7 @@ def test_a_second_run_makes_only_the_reports_again(
     assert not half.exists()
 
 
-def test_what_cannot_be_done_is_said(
-    fitted: Path, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_done_is_said(fitted: Path, recorded: Path, tmp_path: Path, capsys) -> None:
     for arguments, message in (
         (("--out", str(fitted), "--seed", "1"), "another --out, or remove it"),
         (("--out", str(tmp_path / "a"), "--method", "nearest-view"), "a method whose models can be saved"),
@@ -314,9 +306,7 @@ def test_what_cannot_be_done_is_said(
     assert "a folder that no other fit uses" in capsys.readouterr().err
 
 
-def test_the_folder_of_a_benchmark_is_refused(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_folder_of_a_benchmark_is_refused(recorded: Path, tmp_path: Path, capsys) -> None:
     """A fit writes `predictions/` anew: those of methods and scenes in the same place would be gone."""
     of_a_run = tmp_path / "predictions/tfp+4dgs/toy/SHA256SUMS"
     of_a_run.parent.mkdir(parents=True)
@@ -326,9 +316,7 @@ def test_the_folder_of_a_benchmark_is_refused(
     assert of_a_run.exists() and not (tmp_path / MODEL).exists()
 
 
-def test_a_killed_fit_resumes(
-    recorded: Path, tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_killed_fit_resumes(recorded: Path, tmp_path: Path, no_sheet: None, capsys) -> None:
     out = tmp_path / "out"
     arguments = ["fit", str(recorded), "--method", "tfp+static", "--out", str(out), *QUICK]
     code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"

@@ -74,9 +74,7 @@ def test_points_of_the_start_lie_on_the_surfaces() -> None:
     assert len(off) > 1000 and np.median(off) < 0.03
 
 
-def test_where_features_find_nothing_the_networks_poses_stay(
-    placed: tuple[Camera, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_features_find_nothing_the_networks_poses_stay(placed: tuple[Camera, ...], monkeypatch) -> None:
     dark = np.zeros((5, 61, 96), np.float32)
     monkeypatch.setattr("spike4dgs.method.starts.matching.window_means", lambda *args, **options: dark)
     found = refined_poses(FEW, 0, device="cpu").cameras

@@ -162,9 +162,7 @@ def random_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("name", ["spike4dgs", "spike4dgs-uncalibrated"])
-def test_other_weights_of_the_start_are_another_method(
-    name: str, one_small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_weights_of_the_start_are_another_method(name: str, one_small_scene: Path, tmp_path, monkeypatch) -> None:
     shipped = METHODS[name]
     path = tmp_path / "network.safetensors"
     path.write_bytes(WEIGHTS.shipped.read_bytes())

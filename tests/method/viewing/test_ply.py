@@ -95,9 +95,7 @@ def test_extreme_gaussians_stay_finite_and_faded_ones_are_left_out(tmp_path: Pat
     ],
     indirect=["saved"],
 )
-def test_models_that_no_ply_can_hold_are_refused(
-    saved: Path, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_models_that_no_ply_can_hold_are_refused(saved: Path, message: str, tmp_path: Path, capsys) -> None:
     assert main(["export-ply", str(saved), "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()

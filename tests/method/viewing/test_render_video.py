@@ -182,9 +182,7 @@ def test_a_failure_leaves_no_video(tmp_path: Path) -> None:
         (["--frames", "."], ".: expected a new or empty folder"),
     ],
 )
-def test_bad_options_are_one_line(
-    saved: Path, options: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_options_are_one_line(saved: Path, options: list[str], message: str, monkeypatch, capsys) -> None:
     monkeypatch.chdir(saved.parent)
     assert main(["render", str(saved), *options]) == 2
     err = capsys.readouterr().err

@@ -50,9 +50,7 @@ def test_the_three_images() -> None:
 @pytest.mark.parametrize(
     "options", [("--port", "0"), ("--port", "65536"), ("--host", "203.0.113.7"), ("--host", "no such host")]
 )
-def test_view_ends_at_a_bad_host_or_port(
-    tmp_path: Path, options: tuple[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_view_ends_at_a_bad_host_or_port(tmp_path: Path, options: tuple[str, str], capsys) -> None:
     pytest.importorskip("viser", reason="viser is not installed (extra: viewer)")
     model("static").save(path := tmp_path / "m.safetensors", provenance())
     assert main(["view", str(path), *options]) == 2
@@ -114,9 +112,7 @@ def test_an_image_is_padded_to_the_window(aspect: float, shape: tuple[int, int])
     assert 2 * camera.fy * np.tan(fov / 2) == pytest.approx(shape[0]), "the window's angle is the padded image's"
 
 
-def test_without_viser_the_command_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_viser_the_command_says_what_to_install(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", "any.safetensors"]) == 2
     expected = "error: view: expected the package viser, found none; pip install 'spike4dgs[viewer]'\n"

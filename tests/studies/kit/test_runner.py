@@ -45,9 +45,7 @@ def test_a_result_has_every_value_and_json_can_hold_it(tmp_path: Path) -> None:
     json.dumps(result, allow_nan=False)
 
 
-def test_what_fails_is_told_beside_what_was_measured_and_ends_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_fails_is_told_beside_what_was_measured_and_ends_nothing(tmp_path: Path, capsys) -> None:
     lines: list[str] = []
     ms = [measured("bad", breaks), measured("empty", lambda r: ()), measured("good", good)]
     results = measure_all(ms, request(tmp_path), tmp_path / "m", {}, lines.append)

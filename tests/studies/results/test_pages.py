@@ -78,9 +78,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_the_command_checks_and_writes_and_its_ratchet_only_falls(
-    checkout: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_checks_and_writes_and_its_ratchet_only_falls(checkout: Path, capsys) -> None:
     page, records = checkout / "docs/results/page.md", checkout / "records"
     write_row(records, "spike4dgs-x+self-calibrated", [record(scene=scene) for scene in TABLE1.scenes])
     assert results(check=True, records=records) == 1

@@ -23,9 +23,7 @@ def measurements(fail: bool = False) -> tuple[Measurement, ...]:
     return (Measurement("one", "Images from spikes", "one", "a", "b", "c", (MS,), "ms", ("ms",), run),)
 
 
-def test_the_whole_command_in_its_smallest_size(
-    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_whole_command_in_its_smallest_size(small_scene: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "report"
     command = ["report", "speed-error", "--size", "tiny", "--scene", str(small_scene), "--out", str(out)]
     assert main(command) == 0
@@ -59,18 +57,14 @@ def test_a_scene_is_made_once_and_only_when_asked(tmp_path: Path, monkeypatch: p
     assert speed_error.speed_error(out=tmp_path / "b", size="tiny", scene=tmp_path) == 0 and len(made) == 1
 
 
-def test_a_failure_is_exit_1_and_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failure_is_exit_1_and_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setattr(speed_error, "plan", lambda: measurements(fail=True))
     assert speed_error.speed_error(out=tmp_path / "a", size="tiny") == 1
     assert "failed, see the page: one" in capsys.readouterr().out
     assert "OSError: no luck" in (tmp_path / "a/index.html").read_text()
 
 
-def test_what_was_measured_is_measured_again_where_that_is_asked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_measured_is_measured_again_where_that_is_asked(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(speed_error, "plan", measurements)
     for again, kept in ((False, False), (False, True), (True, False)):
         speed_error.speed_error(out=tmp_path / "a", size="tiny", scene=tmp_path, again=again)
