@@ -30,7 +30,7 @@ def same_bits(a: Checkpoint, b: Checkpoint) -> bool:
     )
 
 
-def test_what_is_saved_comes_back(tmp_path: Path) -> None:
+def test_what_is_saved_comes_back_to_its_fit(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "fit.safetensors"
     path.parent.mkdir()
     assert load_checkpoint(path, "fit") is None
@@ -40,6 +40,8 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     assert loaded is not None and same_bits(loaded, some(8))
     assert [p.name for p in path.parent.iterdir()] == ["fit.safetensors"]  # nothing temporary is left
     assert loaded.part("adam").keys() == {"means.0.step"} and not loaded.part("mean")
+    with pytest.raises(UserError, match="expected a checkpoint of this scene, .*found another fit's"):
+        load_checkpoint(path, "other")
 
 
 def test_tensors_that_require_gradients_or_are_not_contiguous_are_saved(tmp_path: Path) -> None:
@@ -95,9 +97,3 @@ def test_a_foreign_file_of_the_same_format_is_refused(metadata: dict[str, str] |
     safetensors.torch.save_file({"x": torch.zeros(2)}, path, metadata=metadata)
     with pytest.raises(UserError, match=message):
         load_checkpoint(path, "fit")
-
-
-def test_another_fits_checkpoint_is_refused(tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", some(), "one")
-    with pytest.raises(UserError, match="expected a checkpoint of this scene, .*found another fit's"):
-        load_checkpoint(tmp_path / "c", "other")

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 from hard_case import HardCase
-from toy_fits import silent, surfaces
+from toy_fits import MOTIONS, SUPERVISIONS, silent, surfaces
 from toy_world import ToyWorld
 
 from spike4dgs.baselines.images.table import IMAGES
-from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
@@ -24,9 +23,6 @@ from spike4dgs.method.starts.base import Start, measure
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.training_images import TrainingImages
-
-MOTIONS = PARTS.motion
-SUPERVISIONS = PARTS.supervision
 
 SETTINGS = TrainerSettings(coarse_steps=3, fine_steps=9, piece_steps=3, views_per_step=3)
 SMALL = {"hexplane": {"mlp_width": 8, "features": 4}}  # of the motion

@@ -1,7 +1,7 @@
 """Long clips: pieces of 20 ms, each fitted from where its neighbour ends."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +9,14 @@ import pytest
 import torch
 from gaussian_clouds import cloud
 from saved_models import DURATION_US, gaussian_model, provenance
-from toy_fits import checkpoints, images, silent
+from toy_fits import checkpoints, images, silent, surfaces
+from toy_fits import trainer as toy_trainer
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.method import FitRequest, Recipe
-from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.gaussians.density import DensitySettings
-from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images.training import ImageSettings, make_training_images, wanted_images
+from spike4dgs.method.images.training import ImageSettings, wanted_images
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.motion import paths as paths_module
@@ -26,19 +25,12 @@ from spike4dgs.method.motion.paths import Paths, PathSettings
 from spike4dgs.method.motion.table import MOTIONS
 from spike4dgs.method.schedule import TrainerSettings, choose_time, stages
 from spike4dgs.method.splat.reference import rotation_matrices
-from spike4dgs.method.starts.base import Initialization, Start, at_most, measure
-from spike4dgs.method.supervision.pixel import Pixel
+from spike4dgs.method.starts.base import Initialization, Start, at_most
 from spike4dgs.method.supervision.table import SUPERVISIONS
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=1200, travel=0.9)
-
-
-def surfaces(scene: TrainingScene, seed: int) -> Start:
-    """Noisy points on the true surfaces at the middle of the clip."""
-    return Start(scene.cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
 
 
 def paths(n_ticks: int) -> Paths:
@@ -83,9 +75,8 @@ def test_the_next_piece_goes_on_as_the_last_one_ends(forward: bool) -> None:
     old, new = motion.splats(g, before), motion.splats(follower, after)
     torch.testing.assert_close(new.means, old.means, rtol=0, atol=1e-12)
     torch.testing.assert_close(rotation_matrices(new.quats), rotation_matrices(old.quats), rtol=0, atol=1e-12)
-    fade = torch.exp(
-        torch.tensor(-((0.5 / PathSettings().static_temporal_scale) ** 2))
-    )  # of a new one, at a piece's end
+    # Of a new one, at a piece's end.
+    fade = torch.exp(torch.tensor(-((0.5 / PathSettings().static_temporal_scale) ** 2)))
     torch.testing.assert_close(new.opacities, old.opacities.clamp(1e-6) * fade.double(), rtol=1e-6, atol=1e-12)
 
     def speed(x, t):  # type: ignore[no-untyped-def]
@@ -96,24 +87,9 @@ def test_the_next_piece_goes_on_as_the_last_one_ends(forward: bool) -> None:
     torch.testing.assert_close(speed(follower, 0.5), speed(follower, after), rtol=0, atol=1e-6)
 
 
-@cache
-def ground() -> tuple[Start, Extent, TrainingImages]:
-    """What every trainer begins with, and none changes."""
-    scene, start, spaced = WORLD.training, surfaces(WORLD.training, 0), ImageSettings(time_spacing_ticks=20)
-    extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, spaced))
-    return start, extent, make_training_images(scene, start.cameras, images, spaced, "cpu")
-
-
-OFTEN = DensitySettings(refine_every=2)
-
-
-def trainer(density: DensitySettings = OFTEN, **settings: int) -> Trainer:
-    scene, (start, extent, training_images) = WORLD.training, ground()
-    s = TrainerSettings(coarse_steps=6, fine_steps=8, piece_steps=8, views_per_step=3, freeze_background=True)
-    motion = Paths(extent, PathSettings(), seeded(0, -1))
-    first = motion.initialize(from_points(start.points[::3], start.values[::3], opacity=0.5), training_images)
-    loss = Pixel(Pixel.defaults, scene)
-    return Trainer(training_images, first, motion, loss, replace(s, **settings), density, scale=extent.scale, seed=3)
+# Three pieces behind a background, densified at every second step.
+SHORT = {"coarse_steps": 6, "fine_steps": 8, "piece_steps": 8, "freeze_background": True}
+trainer = partial(toy_trainer, motion="paths", of=(WORLD, 20), **SHORT)
 
 
 @cache
@@ -144,7 +120,7 @@ def test_a_piece_that_has_ended_stays_as_it_is() -> None:
 
 def test_a_cap_holds_whatever_the_images_size() -> None:
     density = DensitySettings(refine_every=2, max_gaussians=1500, grow_grad2d=0.0)
-    fit = trainer(density, fine_steps=30, coarse_steps=20)
+    fit = trainer(density=density, fine_steps=30, coarse_steps=20)
     start = len(fit.gaussians)
     fit.run(silent)
     assert start < 1500 and len(fit.background) + 750 <= 2250
@@ -152,13 +128,12 @@ def test_a_cap_holds_whatever_the_images_size() -> None:
 
 
 def test_a_start_with_more_points_than_the_cap_is_thinned() -> None:
-    start = surfaces(WORLD.training, 0)
+    start = surfaces(WORLD.training, 0, WORLD)
     points, values = at_most(500, start, 7)
     pairs = {(*p, v) for p, v in zip(start.points.tolist(), start.values.tolist(), strict=True)}
     assert len(points) == len(values) == 500 < len(start.points)
-    assert (
-        len(kept := {(*p, v) for p, v in zip(points.tolist(), values.tolist(), strict=True)}) == 500 and kept <= pairs
-    )
+    kept = {(*p, v) for p, v in zip(points.tolist(), values.tolist(), strict=True)}
+    assert len(kept) == 500 and kept <= pairs
     assert not np.array_equal(points, at_most(500, start, 8)[0]) and at_most(10**6, start, 7)[0] is start.points
 
 
@@ -172,15 +147,8 @@ def test_a_time_is_rendered_by_the_piece_that_it_lies_in(tmp_path: Path) -> None
     model.save(tmp_path / "m", provenance())
     loaded = load_model(tmp_path / "m").model
     assert isinstance(loaded, FittedModel)
-    for share, piece, local in (
-        (-1, 0, 0),
-        (0, 0, 0),
-        (0.2, 0, 0.6),
-        (0.5, 1, 0.5),
-        (0.9, 2, 0.7),
-        (1, 2, 1),
-        (2, 2, 1),
-    ):
+    shares = ((-1, 0, 0), (0, 0, 0), (0.2, 0, 0.6), (0.5, 1, 0.5), (0.9, 2, 0.7), (1, 2, 1), (2, 2, 1))
+    for share, piece, local in shares:
         for m in (model, loaded):
             splats = m.splats(share * DURATION_US)
             expected = m.motion.splats(pieces[piece], local)

@@ -6,22 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from toy_fits import WORLD, images, method, request, silent, surfaces
+from toy_fits import MOTIONS, WORLD, ground, method, request, silent
 
-from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
-from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import RenderOutput, Splats, Views, render
 from spike4dgs.method.splat.ssim import ssim_reference
-from spike4dgs.method.starts.base import measure
 from spike4dgs.method.supervision.base import Render, Sample
 from spike4dgs.method.supervision.pixel import Pixel
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
-
-MOTIONS = PARTS.motion
 
 SETTINGS = TrainerSettings(coarse_steps=15, fine_steps=35, views_per_step=2)
 
@@ -43,22 +38,18 @@ class TrainerTwin(Trainer):
 
 def fifty_steps(motion: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Images [3, V, H, W] near the clip's ends and at its middle, before and after 50 steps of a trainer."""
-    scene = WORLD.training
-    start = surfaces(scene, 0)
-    extent = measure(start, scene)
+    start, extent, training_images = ground()
     first = from_points(start.points[::54], start.values[::54], opacity=0.5)
     model = MOTIONS[motion](extent, MOTIONS[motion].defaults, seeded(0, -1))
-    training_images = make_training_images(scene, start.cameras, images, ImageSettings(time_spacing_ticks=40), "cpu")
     gaussians = model.initialize(first, training_images)
     twin = dtype == torch.float64
     if twin:
         gaussians = Gaussians.from_tensors({k: v.double() for k, v in gaussians.tensors().items()})
-        views = replace(
-            training_images.views, w2c=training_images.views.w2c.double(), K=training_images.views.K.double()
-        )
+        views = training_images.views
+        views = replace(views, w2c=views.w2c.double(), K=views.K.double())
         training_images = replace(training_images, views=views, images=training_images.images.double())
         model = model.double()
-    loss, density = (PixelTwin if twin else Pixel)(Pixel.defaults, scene), DensitySettings()
+    loss, density = (PixelTwin if twin else Pixel)(Pixel.defaults, WORLD.training), DensitySettings()
     kind, size = TrainerTwin if twin else Trainer, {"scale": extent.scale, "seed": 3}
     fit = kind(training_images, gaussians, model, loss, SETTINGS, density, **size)
     assert fit.gaussians.means.dtype == dtype

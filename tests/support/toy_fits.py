@@ -1,6 +1,8 @@
 """Recipes on a small toy world with stand-ins for images and initialisation, for tests of the trainer."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,9 +15,16 @@ from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.fit import Parts, RecipeMethod
+from spike4dgs.method.gaussians.density import DensitySettings
+from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.base import ImageMaker
-from spike4dgs.method.starts.base import Initialization, Start
+from spike4dgs.method.images.training import ImageSettings, make_training_images, wanted_images
+from spike4dgs.method.motion.base import Extent
+from spike4dgs.method.schedule import TrainerSettings
+from spike4dgs.method.starts.base import Initialization, Start, measure
+from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
+from spike4dgs.method.training_views.training_images import Spans, TrainingImages
 
 MOTIONS = BASELINE_PARTS.motion
 SUPERVISIONS = BASELINE_PARTS.supervision
@@ -52,9 +61,41 @@ def around(stream: SpikeStream, tick: int, settings: object) -> np.ndarray:
 images = ImageMaker(name="short", rate=around)  # a stand-in for the images part
 
 
-def surfaces(scene: TrainingScene, seed: int) -> Start:
+def surfaces(scene: TrainingScene, seed: int, world: ToyWorld = WORLD) -> Start:
     """A stand-in for the initialisation: noisy points on the true surfaces at the middle of the clip."""
-    return Start(scene.cameras, *WORLD.surfaces(scene.cameras[::2], 0.01, seed))
+    return Start(scene.cameras, *world.surfaces(scene.cameras[::2], 0.01, seed))
+
+
+@cache
+def ground(world: ToyWorld = WORLD, spacing: int = 40) -> tuple[Start, Extent, TrainingImages]:
+    """What every trainer on a world begins with, and none changes; images lie `spacing` ticks apart."""
+    scene, start, spaced = world.training, surfaces(world.training, 0, world), ImageSettings(time_spacing_ticks=spacing)
+    extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, spaced))
+    return start, extent, make_training_images(scene, start.cameras, images, spaced, "cpu")
+
+
+def trainer(
+    steps: int = 12,
+    motion: str = "hexplane",
+    supervision: str = "pixel",
+    loss: Mapping[str, Any] | None = None,
+    spans: Callable[[TrainingImages], Spans] | None = None,
+    density: DensitySettings | None = None,
+    of: tuple[ToyWorld, int] = (WORLD, 40),
+    **settings: Any,
+) -> Trainer:
+    """A short fit, a third of it at rest, of the world and spacing `of`; it densifies at every second step."""
+    start, extent, training_images = ground(*of)
+    stages = {"coarse_steps": steps // 3, "fine_steps": steps - steps // 3, "views_per_step": 3}
+    sizes = {"mlp_width": 16} if motion == "hexplane" else {}
+    model = MOTIONS[motion](extent, replace(MOTIONS[motion].defaults, **sizes), seeded(0, -1))
+    if spans is not None:
+        training_images = replace(training_images, spans=spans(training_images))
+    kind = SUPERVISIONS[supervision]
+    compare = kind(replace(kind.defaults, **(loss or {})), of[0].training)
+    first = model.initialize(from_points(start.points[::3], start.values[::3], opacity=0.5), training_images)
+    density, numbers = density or DensitySettings(refine_every=2), TrainerSettings(**(stages | settings))
+    return Trainer(training_images, first, model, compare, numbers, density, scale=extent.scale, seed=3)
 
 
 TRUE = Initialization(lambda request: surfaces(request.scene, request.seed))

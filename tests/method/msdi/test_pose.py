@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from hard_case import HardCase
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.arrays import Float64
@@ -39,14 +40,17 @@ def errors(w2c: Float64 | None, true: Float64, scale: float = 1.0) -> tuple[floa
 SURE = np.ones((9, 40, 64))
 
 
+@pytest.mark.hard_case(
+    asked="poses from exact points in units of {scale} m", twin="the true poses", unit="degrees", tolerance=1e-4
+)
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e4])
-def test_exact_points_give_exact_poses_at_any_scale(scale: float) -> None:
-    poses = solve_poses(seen(scale), SURE, K)
+def test_exact_points_give_exact_poses_at_any_scale(hard_case: HardCase, scale: float) -> None:
+    poses = solve_poses(seen(scale), SURE, K, hard_case.seed)
     assert np.array_equal(poses[0].w2c, np.eye(4))
-    for pose, true in zip(poses, TRUE, strict=True):
+    for i, (pose, true) in enumerate(zip(poses, TRUE, strict=True)):
         turn, off = errors(pose.w2c, true, scale)
-        assert pose.found and pose.reason == "" and pose.focal_px is None
-        assert turn < 1e-4 and off < 1e-5
+        assert pose.found and pose.reason == "" and pose.focal_px is None and off < 1e-5
+        hard_case.close(turn, 0.0, f"view {i}")
 
 
 def test_noise_and_outliers_of_low_and_high_confidence() -> None:
@@ -102,12 +106,26 @@ def test_bad_views_have_no_pose_and_say_why_and_leave_the_others() -> None:
         assert turn < 1e-3 and off < 1e-4
 
 
+@pytest.mark.hard_case(
+    asked="points that are NaN, equal, on a line, nonsense, infinite; no confidence",
+    twin="the contract: no pose, and a reason", unit="views with a pose",
+)  # fmt: skip
+def test_points_of_no_pose(hard_case: HardCase) -> None:
+    points = seen()[:2]
+    bad = {str(value): np.full_like(points[1], value) for value in (np.nan, np.inf, 1.0, 1e300)}
+    bad["on a line"] = points[1] * [1, 0, 0] + [0, 0.5, 3.0]
+    bad["nonsense"] = 5 * hard_case.rng().normal(size=points[1].shape)
+    found = {n: solve_poses(np.stack([points[0], p]), SURE[:2], K[:2], hard_case.seed)[1] for n, p in bad.items()}
+    first, found["no confidence"] = solve_poses(points, np.full_like(SURE[:2], np.nan), K[:2])
+    assert first.found
+    posed = [name for name, pose in found.items() if pose.found or not pose.reason]
+    hard_case.check(len(posed), f"poses of {', '.join(posed)}" if posed else f"no pose of {len(found)}")
+
+
 def test_without_any_good_point_nothing_is_raised() -> None:
     for value in (np.nan, 0.0, -1.0, 1e300):
         poses = solve_poses(np.full((3, 8, 8, 3), value), np.ones((3, 8, 8)), None)
         assert [p.found for p in poses] == [False] * 3 and "focal" in poses[0].reason
-    poses = solve_poses(seen()[:2], np.full((2, 40, 64), np.nan), K[:2])
-    assert poses[0].found and not poses[1].found
 
 
 def test_the_same_seed_gives_the_same_poses() -> None:

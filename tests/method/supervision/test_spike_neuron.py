@@ -3,26 +3,33 @@
 import numpy as np
 import pytest
 import torch
+from hard_case import HardCase
 
 from spike4dgs.method.supervision.spike import FLOOR, encode, firing_rate, spike_loss
 
 
-@pytest.mark.parametrize("steps", [1, 7, 70])
-def test_a_hard_reset_is_that_of_a_loop(steps: int) -> None:
-    # Multiples of 2^-12: every sum is exact, and thresholds are met exactly now and then.
-    levels = torch.tensor([0, 1, 82, 1024, 1229, 4095, 4096, 6144], dtype=torch.float64) / 4096
+@pytest.mark.hard_case(
+    asked="{which} of currents 0 to 1e6 from all starts, 1 to 256 steps, {reset} reset",
+    twin="a loop over the steps, float64", unit="spikes per step, or of the slope", tolerance=1e-12,
+)  # fmt: skip
+@pytest.mark.parametrize("which", ["firing rates", "surrogate gradients"])
+@pytest.mark.parametrize("reset", ["subtract", "hard"])
+def test_neurons_are_those_of_a_loop(hard_case: HardCase, reset: str, which: str) -> None:
+    """All numbers are multiples of 2^-12: every sum is exact, and thresholds are met exactly now and then."""
+    levels = torch.tensor([0, 1, 16, 82, 1024, 1229, 2048, 4095, 4096, 6144, 4096e6], dtype=torch.float64) / 4096
     current, start = torch.meshgrid(levels, levels[levels < 1], indexing="ij")
-    charge, count, last = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
-    for step in range(1, steps + 1):
-        charge = charge + current
-        fired = charge >= 1
-        count, last = count + fired, last.where(~fired, step)
-        charge = charge.where(~fired, 0.0)
-    leaf = current.clone().requires_grad_()
-    rate = firing_rate(leaf, start, steps, "hard")
-    rate.sum().backward()
-    torch.testing.assert_close(rate.detach(), count / steps, rtol=0, atol=1e-12)
-    torch.testing.assert_close(leaf.grad, last / steps, rtol=0, atol=1e-12)
+    for steps in (1, 2, 7, 70, 256):
+        charge, count, last = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
+        for step in range(1, steps + 1):
+            charge = charge + current.clamp(max=1)
+            fired = charge >= 1
+            count, last = count + fired, last.where(~fired, step)
+            charge = charge - fired.double() if reset == "subtract" else charge.where(~fired, 0.0)
+        leaf = current.clone().requires_grad_()
+        rate = firing_rate(leaf, start, steps, reset)
+        rate.sum().backward()
+        found, expected = (rate.detach(), count) if which == "firing rates" else (leaf.grad, last)
+        hard_case.close(found.numpy(), (expected / steps).numpy(), f"{steps} steps")
 
 
 def test_mean_over_starts_is_the_current_and_the_surrogate_its_finite_difference() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 import torch
+from hard_case import HardCase
 from torch import Tensor
 
 from spike4dgs.method.training_views.instants import REACH, Corrections, correction, node, recount
@@ -44,14 +45,23 @@ def test_quadratic_light_over_any_span_becomes_the_instant(half: float) -> None:
     assert (mean(p, a, b) - light(p, 0.0)).abs().max() > 1e-3, "without it they differ"
 
 
+@pytest.mark.hard_case(
+    asked="instants from means of light of the fifth power in time, over 10 and 20 ticks",
+    twin="the light in closed form", unit="of radiance", tolerance=1e-8,
+)  # fmt: skip
+def test_light_of_the_fifth_power(hard_case: HardCase) -> None:
+    p = polynomial(0.5, 0.01, -2e-3, 1e-4, 3e-5, -2e-6)
+    for half in (5.0, 10.0):
+        ends = torch.full(SHAPE, half, dtype=torch.float64)
+        hard_case.close(corrected(p, -ends, ends, half).numpy(), light(p, 0.0).numpy(), f"{2 * half:g} ticks")
+
+
 def test_a_span_that_reaches_far_is_not_followed_to_its_end() -> None:
     p, far = polynomial(0.5, 0.01), random(20, 60, 9)
-    followed = correction(
-        *(light(p, t) for t in (-node(5.0), 0.0, node(5.0))), Spans(torch.stack([-far, far], 1), 5.0, 99)
-    )
-    at_most = correction(
-        *(light(p, t) for t in (-node(5.0), 0.0, node(5.0))),
-        Spans(torch.stack([torch.full(SHAPE, -5.0 * REACH), torch.full(SHAPE, 5.0 * REACH)], 1), 5.0, 99),
+    around = [light(p, t) for t in (-node(5.0), 0.0, node(5.0))]
+    followed, at_most = (
+        correction(*around, Spans(torch.stack([-end, end], 1), 5.0, 99))
+        for end in (far, torch.full(SHAPE, 5.0 * REACH))
     )
     torch.testing.assert_close(followed, at_most)
 
