@@ -19,20 +19,10 @@ WIDTH, HEIGHT, FPS = 24, 10, 20000
 
 def rig(n: int, layout: str = "plain", **changes: object) -> RigProfile:
     """Return a rig of n small cameras, the second one the primary, whose reads are 1 KiB."""
-    cameras = tuple(
-        CameraProfile(
-            id=f"cam_{i:02d}",
-            serial=f"S{i}",
-            vendor_id=0x0403,
-            product_id=0x601F,
-            endpoint_in=0x82,
-            endpoint_out=0x02,
-            start=(b"go",),
-            stop=(b"halt",),
-            role="primary" if i == min(1, n - 1) else "secondary",
-        )
-        for i in range(n)
-    )
+    device = {"vendor_id": 0x0403, "product_id": 0x601F, "endpoint_in": 0x82, "endpoint_out": 0x02}
+    device |= {"start": (b"go",), "stop": (b"halt",)}
+    roles = ["primary" if i == min(1, n - 1) else "secondary" for i in range(n)]
+    cameras = tuple(CameraProfile(id=f"cam_{i:02d}", serial=f"S{i}", role=r, **device) for i, r in enumerate(roles))
     profile = RigProfile("test", WIDTH, HEIGHT, layout, cameras, FPS, transfer_bytes=1024, transfers=3, timeout_ms=150)
     return replace(profile, **changes)  # type: ignore[arg-type]
 
@@ -134,10 +124,8 @@ class FakeTransfers:
 def rig_of(streams: Sequence[UInt8], profile: RigProfile) -> dict[str, FakeCamera]:
     """Return a fake camera for each stream, by id; all write to one log."""
     log: list[str] = []
-    return {
-        c.id: FakeCamera(c, np.ascontiguousarray(streams[i]).reshape(-1), log=log)
-        for i, c in enumerate(profile.cameras)
-    }
+    sent = [np.ascontiguousarray(streams[i]).reshape(-1) for i in range(len(profile.cameras))]
+    return {c.id: FakeCamera(c, stream, log=log) for c, stream in zip(profile.cameras, sent, strict=True)}
 
 
 def layout_of(profile: RigProfile) -> Layout:

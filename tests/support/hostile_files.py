@@ -72,39 +72,9 @@ def read_all(reads: Iterable[Callable[[], Any]]) -> None:
 
 
 def make_scene(folder: Path) -> None:
-    from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
+    from full_scene import write_full_scene
 
-    from spike4dgs.benchmark.scene.images import write_geometry, write_png
-    from spike4dgs.benchmark.scene.manifest import write_manifest
-    from spike4dgs.benchmark.scene.other_sensors import Events, write_events
-    from spike4dgs.benchmark.spikes.stream import pack
-
-    facts = {
-        "conventional": {"fps": 60, "exposure_s": 0.001},
-        "events": {"threshold": 0.2},
-        "calibration": {"flat_radiance": 0.7, "flat_ticks": 40, "dark_ticks": 40},
-        "instances": {"1": "board"},
-    }
-    root, rng = write_small_scene(folder / "scene", splits=True, extras=facts), np.random.default_rng(0)
-    for i in range(4):
-        camera = f"cam_{i:02d}"
-        write_png(root / f"conventional/{camera}/000000.png", rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8))
-        t = np.sort(rng.integers(0, TICKS * 50, 20))
-        x, y = (rng.integers(0, side, 20).astype(np.uint16) for side in (WIDTH, HEIGHT))
-        write_events(root / f"events/{camera}.npz", Events(t, x, y, rng.integers(0, 2, 20).astype(np.uint8)))
-        for name, rate in (("flat", 0.5), ("dark", 0.02)):
-            path = root / f"calibration/{name}/{camera}.dat"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pack(rng.random((40, HEIGHT, WIDTH)) < rate).tofile(path)
-    shape = (HEIGHT, WIDTH)
-    write_geometry(
-        root / "geometry/cam_03/000020.exr",
-        np.ones(shape, np.float32),
-        np.zeros(shape, np.uint32),
-        np.zeros((*shape, 2)),
-        1.0,
-    )
-    write_manifest(root)
+    write_full_scene(folder / "scene")
 
 
 def rehash(folder: Path) -> None:
@@ -147,17 +117,14 @@ def make_predictions(folder: Path) -> None:
     with PredictionWriter(folder / "predictions") as writer:
         for target in scene.targets:
             writer.add(target, scene.ground_truth(target) * np.float32(0.9), 1.0)
-        writer.finish(
-            PredictionInfo(MethodInfo("mine", "1", {"a": {"b": 1.5}}, 0), scene.id, scene.revision, fit_seconds=1.5)
-        )
+        method = MethodInfo("mine", "1", {"a": {"b": 1.5}}, 0)
+        writer.finish(PredictionInfo(method, scene.id, scene.revision, fit_seconds=1.5))
 
 
 def resum(folder: Path) -> None:
     root = folder / "predictions"
-    lines = [
-        f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(root)}\n" for p in sorted(root.rglob("*.exr"))
-    ]
-    (root / "SHA256SUMS").write_text("".join(lines))
+    sums = {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(root.rglob("*.exr"))}
+    (root / "SHA256SUMS").write_text("".join(f"{digest}  {p.relative_to(root)}\n" for p, digest in sums.items()))
 
 
 def read_predictions(folder: Path, out: Path) -> None:
@@ -165,9 +132,8 @@ def read_predictions(folder: Path, out: Path) -> None:
     from spike4dgs.benchmark.runs.score import score_predictions
     from spike4dgs.benchmark.scene.scene import open_scene
 
-    score_predictions(
-        folder / "predictions", [open_scene(folder / "scene")], select_metrics().among(["psnr", "psnr_aligned"])
-    )
+    chosen = select_metrics().among(["psnr", "psnr_aligned"])
+    score_predictions(folder / "predictions", [open_scene(folder / "scene")], chosen)
 
 
 # ---------------------------------------------------------------- records and the leaderboard
@@ -181,9 +147,8 @@ def make_record(folder: Path) -> None:
 
     make_predictions(folder)
     chosen = select_metrics().among(["psnr", "psnr_aligned", "ssim"])
-    write_record(
-        folder / "mine.json", score_predictions(folder / "predictions", [open_scene(folder / "scene")], chosen)
-    )
+    record = score_predictions(folder / "predictions", [open_scene(folder / "scene")], chosen)
+    write_record(folder / "mine.json", record)
     shutil.rmtree(folder / "scene"), shutil.rmtree(folder / "predictions")
 
 
@@ -220,11 +185,10 @@ def relist(folder: Path) -> None:
     from spike4dgs.benchmark.files import sha256_json
     from spike4dgs.leaderboard.entry import add_line
 
-    for path in (folder / "board").glob("*/*/*.json"):
+    board = folder / "board"
+    for path in board.glob("*/*/*.json"):
         with contextlib.suppress(Exception):
-            add_line(
-                folder / "board", sha256_json(json.loads(path.read_text())), f"{path.relative_to(folder / 'board')}"
-            )
+            add_line(board, sha256_json(json.loads(path.read_text())), f"{path.relative_to(board)}")
 
 
 # ---------------------------------------------------------------- models, weights, bursts
@@ -320,9 +284,8 @@ def make_imports(folder: Path) -> None:
     model = pycolmap.Reconstruction()
     for i, c in enumerate(cameras, start=1):
         params = [c.fx, c.fy, c.cx, c.cy, 0.01, 0, 0, 0]
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=i, model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
-        )
+        camera = pycolmap.Camera(camera_id=i, model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
+        model.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(image_id=i, camera_id=i, name=f"{c.id}.png")
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t))
     model.add_point3D(np.zeros(3), pycolmap.Track(), np.full(3, 128, dtype=np.uint8))
@@ -352,9 +315,8 @@ def make_imports(folder: Path) -> None:
     (folder / "kalibr.yaml").write_text(yaml.safe_dump(chain))
     (folder / "spikecv").mkdir()
     rng.integers(0, 256, 16 * HEIGHT * WIDTH // 8, dtype=np.uint8).tofile(folder / "spikecv/a.dat")
-    (folder / "spikecv/config.yaml").write_text(
-        yaml.safe_dump({"filename": "a.dat", "spike_w": WIDTH, "spike_h": HEIGHT})
-    )
+    config = {"filename": "a.dat", "spike_w": WIDTH, "spike_h": HEIGHT}
+    (folder / "spikecv/config.yaml").write_text(yaml.safe_dump(config))
 
 
 def read_imports(folder: Path, out: Path) -> None:
@@ -407,10 +369,10 @@ def make_recording(folder: Path) -> None:
     from spike4dgs.benchmark.spikes.gaps import Gap
     from spike4dgs.benchmark.spikes.stream import open_stream, pack
 
-    rig = POSED.replace('role = "primary"', 'role = "primary"\nmaps = "left.npz"').replace(
-        "3.5]", "3.5]\ndistortion = [0.01, 0.0]"
-    )
-    (folder / "rig.toml").write_text(rig.replace('"plain"', '"plain"\nfps = 20000\nheld_out = ["left"]'))
+    rig, more = POSED, {'role = "primary"': 'maps = "left.npz"', "3.5]": "distortion = [0.01, 0.0]"}
+    for line, after in (more | {'"plain"': 'fps = 20000\nheld_out = ["left"]'}).items():
+        rig = rig.replace(line, f"{line}\n{after}")
+    (folder / "rig.toml").write_text(rig)
     np.savez_compressed(folder / "left.npz", gain=np.ones((24, 40)), dark=np.zeros((24, 40)))
     streams = {}
     for name in ("left", "right"):
@@ -426,60 +388,34 @@ def read_recording(folder: Path, out: Path) -> None:
     read_all([lambda: load_profile(folder / "rig.toml"), lambda: open_stream_folder(folder, allow_gaps=True)])
 
 
+_JSON_OF_SCENE = ("scene/scene.json", "scene/transforms_t*.json", "scene/targets.json", "scene/manifest.json")
+_OF_SCENE: dict[str, m.Mutation | None] = {
+    **dict.fromkeys(_JSON_OF_SCENE, m.in_json),
+    **dict.fromkeys(("scene/spikes/*.dat", "scene/calibration/*/*.dat"), None),
+    **dict.fromkeys(("scene/images/*/*.exr", "scene/geometry/*/*.exr"), m.in_exr),
+    **dict.fromkeys(("scene/masks/*/*.png", "scene/conventional/*/*.png"), m.in_png),
+    "scene/events/*.npz": m.in_npz,
+}
+_OF_PREDICTIONS = {"prediction.json": m.in_json, "SHA256SUMS": m.in_text, "*/*.exr": m.in_exr}
+_OF_TENSORS = {"*.safetensors": m.in_safetensors, "fit.ckpt": m.in_safetensors, "state.pth": None}
+_OF_IMPORTS: dict[str, m.Mutation | None] = {
+    **dict.fromkeys(("colmap-text/*.txt", "opencv.*", "kalibr.yaml", "spikecv/config.yaml"), m.in_text),
+    **dict.fromkeys(("colmap/*.bin", "in/*.dat", "spikecv/a.dat"), None),
+}
+_OF_FOOTAGE = {"images/png/*": m.in_png, "images/[jbt]*/*": None, "videos/*": None, "points.csv": m.in_text}
+_OF_RECORDING = {"rig.toml": m.in_text, "stream.json": m.in_json, "left.npz": m.in_npz}
 CASES: dict[str, Case] = {
-    "scene": Case(
-        35,
-        make_scene,
-        read_scene,
-        {
-            **dict.fromkeys(("scene/scene.json", "scene/transforms_t*.json", "scene/targets.json"), m.in_json),
-            "scene/manifest.json": m.in_json,
-            "scene/spikes/*.dat": None,
-            "scene/calibration/*/*.dat": None,
-            **dict.fromkeys(("scene/images/*/*.exr", "scene/geometry/*/*.exr"), m.in_exr),
-            **dict.fromkeys(("scene/masks/*/*.png", "scene/conventional/*/*.png"), m.in_png),
-            "scene/events/*.npz": m.in_npz,
-        },
-        rehash,
-    ),
+    "scene": Case(35, make_scene, read_scene, _OF_SCENE, rehash),
     "predictions": Case(
-        10,
-        make_predictions,
-        read_predictions,
-        {
-            "predictions/prediction.json": m.in_json,
-            "predictions/SHA256SUMS": m.in_text,
-            "predictions/*/*.exr": m.in_exr,
-        },
-        resum,
+        10, make_predictions, read_predictions, {f"predictions/{k}": v for k, v in _OF_PREDICTIONS.items()}, resum
     ),
     "record": Case(13, make_record, read_record_file, {"mine.json": m.in_json}),
     "board": Case(6, make_board, read_board, {"board/local/*/*.json": m.in_json, "board/LEDGER": m.in_text}, relist),
     "models": Case(8, make_models, read_models, {"*.safetensors": in_model}, rehash_model),
-    "tensors": Case(
-        8,
-        make_tensors,
-        read_tensors,
-        {"*.safetensors": m.in_safetensors, "fit.ckpt": m.in_safetensors, "state.pth": None},
-    ),
-    "imports": Case(
-        10,
-        make_imports,
-        read_imports,
-        {
-            **dict.fromkeys(("colmap-text/*.txt", "opencv.*", "kalibr.yaml", "spikecv/config.yaml"), m.in_text),
-            **dict.fromkeys(("colmap/*.bin", "in/*.dat", "spikecv/a.dat"), None),
-        },
-    ),
-    "footage": Case(
-        5,
-        make_footage,
-        read_footage,
-        {"images/png/*": m.in_png, "images/[jbt]*/*": None, "videos/*": None, "points.csv": m.in_text},
-    ),
-    "recording": Case(
-        5, make_recording, read_recording, {"rig.toml": m.in_text, "stream.json": m.in_json, "left.npz": m.in_npz}
-    ),
+    "tensors": Case(8, make_tensors, read_tensors, _OF_TENSORS),
+    "imports": Case(10, make_imports, read_imports, _OF_IMPORTS),
+    "footage": Case(5, make_footage, read_footage, _OF_FOOTAGE),
+    "recording": Case(5, make_recording, read_recording, _OF_RECORDING),
 }
 
 # ---------------------------------------------------------------- running

@@ -30,19 +30,9 @@ def shared_file(name: str) -> Path:
 
 def array_cameras(n: int = 4, width: int = WIDTH, height: int = HEIGHT) -> tuple[Camera, ...]:
     """Cameras in a row that look at the origin from 3 m away."""
-    up = np.array([0.0, 0.0, 1.0])
-    return tuple(
-        look_at(
-            f"cam_{i:02d}",
-            np.array([0.15 * (i - 1.5), -3.0, 0.8]),
-            np.zeros(3),
-            up,
-            focal=1.2 * width,
-            width=width,
-            height=height,
-        )
-        for i in range(n)
-    )
+    up, size = np.array([0.0, 0.0, 1.0]), {"focal": 1.2 * width, "width": width, "height": height}
+    at = [np.array([0.15 * (i - 1.5), -3.0, 0.8]) for i in range(n)]
+    return tuple(look_at(f"cam_{i:02d}", center, np.zeros(3), up, **size) for i, center in enumerate(at))
 
 
 def write_small_scene(

@@ -42,23 +42,15 @@ class ToyWorld:
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
-        offsets = np.linspace(-0.4, 0.4, self.side)
-        return tuple(
-            replace(
-                look_at(
-                    f"cam_{i:02d}",
-                    np.array([x, -3.0, 1.0 + z]),
-                    np.array([0.0, 0.3, 0.7]),
-                    np.array([0.0, 0.0, 1.0]),
-                    focal=1.2 * self.width * (1 + self.spread * (i % 4 - 1.5)),
-                    width=self.width,
-                    height=self.height,
-                ),
-                distortion=self.lens,
-                cx=self.width * (0.5 + self.spread * (i % 3 - 1)),
-            )
-            for i, (z, x) in enumerate((z, x) for z in offsets for x in offsets)
-        )
+        offsets, cameras = np.linspace(-0.4, 0.4, self.side), []
+        target, up = np.array([0.0, 0.3, 0.7]), np.array([0.0, 0.0, 1.0])
+        for i, (z, x) in enumerate((z, x) for z in offsets for x in offsets):
+            focal = 1.2 * self.width * (1 + self.spread * (i % 4 - 1.5))
+            size = {"focal": focal, "width": self.width, "height": self.height}
+            camera = look_at(f"cam_{i:02d}", np.array([x, -3.0, 1.0 + z]), target, up, **size)
+            cx = self.width * (0.5 + self.spread * (i % 3 - 1))
+            cameras.append(replace(camera, distortion=self.lens, cx=cx))
+        return tuple(cameras)
 
     def texture(self, surface: int, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Band-limited gray pattern of a surface at its coordinates (a, b) in metres."""

@@ -4,23 +4,25 @@ their own, which has the library preloaded; they are not collected otherwise.
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import usb.backend.libusb1
+from emulated_rig import profile_of as emulated_profile
 from recorder_rig import FRAME, TICKS, check_identical, check_recording, record, source_scene
 from usb_mock import UsbMock
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_profile, scene_streams
+from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_streams
 from spike4dgs.generators.recorder.emulation.camera import Fault
 from spike4dgs.generators.recorder.frames.clip import CameraClip
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.usb.ports import UsbPort, usb_ports
 
-BLOCK, QUEUED = 1024, 4
+QUEUED = 4  # reads of the profile
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +51,7 @@ def bus() -> Iterator[Any]:
         yield plug_in
 
 
-def profile_of(scene: Scene, **changes: object) -> RigProfile:
-    # The time limit is for a busy machine.
-    return scene_profile(scene, **({"transfer_bytes": BLOCK, "transfers": QUEUED, "timeout_ms": 60000} | changes))
+profile_of = partial(emulated_profile, timeout_ms=60000)  # for a busy machine
 
 
 def test_nine_superspeed_devices_are_found_by_serial_and_recorded_bit_for_bit(

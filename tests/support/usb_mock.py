@@ -53,9 +53,8 @@ class UsbMock:
         self.lib = library()
         self.testbed = self.lib.testbed_new()
         hub = struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0300, 9, 0, 3, 9, 0x1D6B, 3, 0x0617, 0, 0, 0, 1)
-        hub += struct.pack("<BBHBBBBB", 9, 2, 31, 1, 1, 0, 0xE0, 0) + struct.pack(
-            "<BBBBBBBBB", 9, 4, 0, 0, 1, 9, 0, 0, 0
-        )
+        hub += struct.pack("<BBHBBBBB", 9, 2, 31, 1, 1, 0, 0xE0, 0)
+        hub += struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 1, 9, 0, 0, 0)
         hub += struct.pack("<BBBBHB", 7, 5, 0x81, 3, 4, 12) + struct.pack("<BBBBH", 6, 0x30, 0, 0, 2)
         self.add(_ROOT_HUB, 1, hub, {"idVendor": "1d6b", "idProduct": "0003", "devpath": "0", "speed": "5000"})
         for name, camera in self.array.cameras.items():
@@ -67,22 +66,10 @@ class UsbMock:
     def add(self, path: str, number: int, descriptors: bytes, attributes: dict[str, str]) -> None:
         """Add a device to sysfs, with its node."""
         node, text = f"bus/usb/001/{number:03d}", descriptors.hex().upper()
-        properties = {
-            "DEVNAME": f"/dev/{node}",
-            "DEVTYPE": "usb_device",
-            "SUBSYSTEM": "usb",
-            "BUSNUM": "001",
-            "DEVNUM": f"{number:03d}",
-            "MAJOR": "189",
-            "MINOR": str(number - 1),
-        }
-        attributes = attributes | {
-            "busnum": "1",
-            "devnum": str(number),
-            "dev": f"189:{number - 1}",
-            "bConfigurationValue": "1",
-            "bNumConfigurations": "1",
-        }
+        properties = {"DEVNAME": f"/dev/{node}", "DEVTYPE": "usb_device", "SUBSYSTEM": "usb", "BUSNUM": "001"}
+        properties |= {"DEVNUM": f"{number:03d}", "MAJOR": "189", "MINOR": str(number - 1)}
+        attributes = attributes | {"busnum": "1", "devnum": str(number), "dev": f"189:{number - 1}"}
+        attributes |= {"bConfigurationValue": "1", "bNumConfigurations": "1"}
         lines = [f"P: {path}", f"N: {node}={text}", *(f"E: {k}={v}" for k, v in properties.items())]
         lines += [*(f"A: {k}={v}" for k, v in attributes.items()), f"H: descriptors={text}", "", ""]
         self.check(self.lib.testbed_add_from_string, "\n".join(lines).encode())
@@ -111,18 +98,9 @@ class MockDevice:
         self._done: deque[tuple[Any, Urb]] = deque()
         self._gone = False
         profile, slow = camera.profile, mock.array.has(camera.profile.id, HIGH_SPEED)
-        mock.add(
-            self.path,
-            number,
-            descriptors(camera, slow),
-            {
-                "idVendor": f"{profile.vendor_id:04x}",
-                "idProduct": f"{profile.product_id:04x}",
-                "devpath": str(number),
-                "serial": profile.serial,
-                "speed": "480" if slow else "5000",
-            },
-        )
+        attributes = {"idVendor": f"{profile.vendor_id:04x}", "idProduct": f"{profile.product_id:04x}"}
+        attributes |= {"devpath": str(number), "serial": profile.serial, "speed": "480" if slow else "5000"}
+        mock.add(self.path, number, descriptors(camera, slow), attributes)
         self._callback = Handler(self._on_ioctl)  # libumockdev keeps the address, so we keep the object
         self._handler = mock.lib.ioctl_base_new()
         mock.lib.connect(self._handler, b"handle-ioctl", self._callback, None, None, 0)
