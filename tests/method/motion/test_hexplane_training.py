@@ -33,9 +33,8 @@ def gaussians(n: int = 40) -> Gaussians:
 def trainer(density: DensitySettings = DENSITY, planes: HexPlaneSettings = PLANES) -> Trainer:
     times = (10, 50, 90)
     frames = [[WORLD.trace(c, t / 100)[0] for c in WORLD.cameras] for t in times]
-    images = TrainingImages(
-        Views.from_cameras(WORLD.cameras), times, torch.from_numpy(np.array(frames, np.float32)), n_ticks=100
-    )
+    seen = torch.from_numpy(np.array(frames, np.float32))
+    images = TrainingImages(Views.from_cameras(WORLD.cameras), times, seen, n_ticks=100)
     motion = HexPlaneMotion(EXTENT, planes, seeded(0, -1))
     loss = Pixel(Pixel.defaults, WORLD.training)
     return Trainer(images, gaussians(), motion, loss, SETTINGS, density, scale=3.0, seed=0)
@@ -102,13 +101,7 @@ def test_images_are_never_negative() -> None:
     g = gaussians()
     g.colors[:] = -1.0
     static = Static(EXTENT, Static.defaults, seeded(0, 0))
-    model = FittedModel(
-        (g,),
-        g.rows(torch.zeros(len(g), dtype=torch.bool)),
-        static,
-        1000.0,
-        "cpu",
-        MotionSpec("static", EXTENT, Static.defaults),
-    )
+    none, spec = g.rows(torch.zeros(len(g), dtype=torch.bool)), MotionSpec("static", EXTENT, Static.defaults)
+    model = FittedModel((g,), none, static, 1000.0, "cpu", spec)
     image = model.render(WORLD.cameras[0], 500.0)
     assert image.dtype == np.float32 and (image == 0).all()

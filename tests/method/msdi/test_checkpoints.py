@@ -23,27 +23,15 @@ EMBED = replace(TINY, embed_channels=3)  # as the published patch embedding
 DUST3R = Dust3rShape(2, 16, 2, 4, 24, 2, 16, (4, 6, 8, 12), 16)
 
 
-def layer(width: int) -> dict[str, tuple[int, ...]]:
-    """Return names and shapes of a published transformer layer."""
-    return {
-        "norm1.weight": (width,),
-        "norm1.bias": (width,),
-        "attn.qkv.weight": (3 * width, width),
-        "attn.qkv.bias": (3 * width,),
-        "attn.proj.weight": (width, width),
-        "attn.proj.bias": (width,),
-        "norm2.weight": (width,),
-        "norm2.bias": (width,),
-        "mlp.fc1.weight": (4 * width, width),
-        "mlp.fc1.bias": (4 * width,),
-        "mlp.fc2.weight": (width, 4 * width),
-        "mlp.fc2.bias": (width,),
-    }
-
-
 def conv(name: str, *shape: int, bias: bool = True) -> dict[str, tuple[int, ...]]:
     parts: dict[str, tuple[int, ...]] = {f"{name}.weight": shape}
     return parts | ({f"{name}.bias": (shape[0],)} if bias else {})
+
+
+def layer(w: int) -> dict[str, tuple[int, ...]]:
+    """Return names and shapes of a published transformer layer."""
+    attention = conv("attn.qkv", 3 * w, w) | conv("attn.proj", w, w)
+    return conv("norm1", w) | attention | conv("norm2", w) | conv("mlp.fc1", 4 * w, w) | conv("mlp.fc2", w, 4 * w)
 
 
 def head(prefix: str, c: MsdiConfig) -> dict[str, tuple[int, ...]]:

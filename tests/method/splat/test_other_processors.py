@@ -76,14 +76,8 @@ def modules(tmp_path_factory: pytest.TempPathFactory) -> list[Module]:
 @pytest.mark.parametrize("triple", ["aarch64-unknown-linux-gnu", "arm64-apple-macosx"])
 def test_every_kernel_becomes_code_of_arm(modules: list[Module], triple: str) -> None:
     found = [module for module in modules if module[1] == triple]
-    for kernel in (
-        "project_forward",
-        "project_backward",
-        "raster_forward",
-        "raster_backward",
-        "_loss_kernel",
-        "_unpack",
-    ):
+    project_and_raster = [f"{work}_{way}" for work in ("project", "raster") for way in ("forward", "backward")]
+    for kernel in (*project_and_raster, "_loss_kernel", "_unpack"):
         assert any(kernel in name for name, *_ in found), kernel
     assert not [(name, x86) for name, _, x86, lines, _ in found if x86 or not lines]
     assert sum(vectors for *_, vectors in found) > 100, "NEON multiplies four floats at once"

@@ -45,15 +45,8 @@ def test_matrix_products_blur_as_convolutions_do(shape: tuple[int, int, int]) ->
 
 def test_inner_region_equals_scikit_image() -> None:
     a, b = images(1, 64, 80)
-    full = structural_similarity(
-        a[0].double().numpy(),
-        b[0].double().numpy(),
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        data_range=1,
-        full=True,
-    )[1]
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "full": True}
+    full = structural_similarity(a[0].double().numpy(), b[0].double().numpy(), **options)[1]
     # Padding differs only within half a window of the border.
     inner = ssim_map(a, b)[5:-5, 5:-5]
     np.testing.assert_allclose(inner, full[5:-5, 5:-5], atol=1e-9)

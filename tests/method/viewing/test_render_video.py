@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from saved_models import DURATION_US, MODELS, WORLD, model, provenance
+from saved_models import DURATION_US, WORLD, model, provenance
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.video import video_writer
@@ -30,11 +30,8 @@ def parallel(n: int = 3) -> tuple[Camera, ...]:
     return tuple(replace(one, id=f"c{i}", t=-one.R @ np.array([0.2 * i, 0, 0])) for i in range(n))
 
 
-def test_the_focus_is_the_target_of_the_cameras() -> None:
+def test_the_focus_is_the_target_of_the_cameras_or_in_front_of_parallel_ones() -> None:
     np.testing.assert_allclose(focus(WORLD.cameras), [0.0, 0.3, 0.7], atol=1e-9)
-
-
-def test_the_focus_of_parallel_cameras_is_in_front_of_them() -> None:
     np.testing.assert_allclose(focus(parallel()), [0.2, 1.0, 0.0], atol=1e-9)  # five radii of 0.2 m
     np.testing.assert_allclose(focus(parallel(1)), [0.0, 5.0, 0.0], atol=1e-9)
 
@@ -202,7 +199,3 @@ def test_speed_render_puts_models_side_by_side(tmp_path: Path, capsys: pytest.Ca
     for row in rows[:2]:
         assert float(row["min ms"]) <= float(row["median ms"])
         assert float(row["frames/s"]) == pytest.approx(1e3 / float(row["median ms"]), rel=0.05)
-
-
-def test_every_kind_of_model_is_known_here() -> None:
-    assert set(MODELS) >= {"static", "hexplane", "spacetime", "spacetime-lite", "tracking", "radiance-field"}
