@@ -3,13 +3,13 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from resumed import check_resumed
 from slow_images import stream_of
-from small_scenes import GAIN, HEIGHT, WIDTH, write_small_scene
+from small_scenes import GAIN, HEIGHT, WIDTH, add_gap, write_small_scene
 
 from spike4dgs.baselines.images.spk2img import maker
 from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, load_network
@@ -115,22 +115,16 @@ def test_the_public_benchmark_and_seasons_are_refused(small_scene: Path) -> None
 def test_images_whose_spikes_lack_ticks_are_not_trained_on(
     small_scene: Path, camera: str, first_tick: int, ticks: int, kept: list[int]
 ) -> None:
-    write_gaps(small_scene, [{"camera": camera, "first_tick": first_tick, "ticks": ticks, "reason": "overflow"}])
+    add_gap(small_scene, camera, first_tick, ticks)
     assert [e.tick for e in read_examples(open_for_training(small_scene, allow_gaps=True))] == kept
 
 
 def test_gaps_are_refused_unless_allowed(small_scene: Path, tmp_path: Path) -> None:
-    write_gaps(small_scene, [{"camera": "cam_03", "first_tick": 0, "ticks": 80, "reason": "overflow"}])
+    add_gap(small_scene, "cam_03", 0, 80)
     with pytest.raises(UserError, match="a recording without gaps"):
         train_spk2img(scenes=(small_scene,), out=tmp_path / "out")
     with pytest.raises(UserError, match="with ground truth, found no image that has all its spikes"):
         train_spk2img(scenes=(small_scene,), out=tmp_path / "out", allow_gaps=True)
-
-
-def write_gaps(scene: Path, gaps: list[dict[str, Any]]) -> None:
-    meta = json.loads((scene / "scene.json").read_text())
-    (scene / "scene.json").write_text(json.dumps({**meta, "gaps": gaps}))
-    write_manifest(scene)
 
 
 def test_loss_from_its_definition() -> None:
@@ -160,20 +154,7 @@ def test_training_learns(small_scene: Path) -> None:
 
 def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(small_scene: Path, tmp_path: Path) -> None:
     examples = read_examples(open_for_training(small_scene))
-    whole, first, second = (Training(examples, SMALL, "cpu", seed=2) for _ in range(3))
-    for _ in range(6):
-        whole.train_step()
-    for _ in range(3):
-        first.train_step()
-    first.save(tmp_path / "c.safetensors", "key")
-    second.resume(tmp_path / "c.safetensors", "key")
-    assert second.step == 3
-    for _ in range(3):
-        second.train_step()
-    for name, value in whole.network.state_dict().items():
-        assert torch.equal(value, second.network.state_dict()[name]), name
-    with pytest.raises(UserError, match="another fit's"):
-        second.resume(tmp_path / "c.safetensors", "another key")
+    check_resumed(lambda: Training(examples, SMALL, "cpu", seed=2), tmp_path / "c.safetensors")
 
 
 def test_command_to_weights_to_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:

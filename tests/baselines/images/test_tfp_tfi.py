@@ -59,8 +59,8 @@ def test_the_interval_contains_the_start_of_the_tick() -> None:
     np.testing.assert_allclose(image[30:], 0.5)
 
 
-@pytest.mark.parametrize("name", ["tfp", "tfi"])
-@pytest.mark.parametrize("radiance", [0.02, 0.3, 1.0])
+@pytest.mark.parametrize("name", ["tfp", "tfi", "tfstp"])
+@pytest.mark.parametrize("radiance", [0.02, 0.11, 0.3, 0.77, 1.0])
 def test_constant_light_is_recovered_without_bias_or_flicker(name: str, radiance: float) -> None:
     """Ideal integrate-and-fire pixels of all phases, gain 0.6; also at the first and last ticks."""
     phase = (np.arange(2000).reshape(40, 50) + 0.5) / 2000
@@ -69,6 +69,8 @@ def test_constant_light_is_recovered_without_bias_or_flicker(name: str, radiance
     images = IMAGES[name](stream, [0, 1, 150, 298, 299], gain=0.6)
     assert images.shape == (5, 40, 50) and images.dtype == np.float32
     np.testing.assert_allclose(images.mean(axis=(1, 2)), radiance, rtol=0.03)
+    intervals = IMAGES["tfi"](stream, [150], gain=0.6)[0]
+    assert name == "tfp" or images[2].std() <= intervals.std() * (1 + 1e-6), "TFSTP flickers less than intervals do"
 
 
 def test_a_moving_edge_is_where_it_was_at_the_start_of_the_tick() -> None:

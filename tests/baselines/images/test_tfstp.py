@@ -85,18 +85,6 @@ def test_sparse_pixels_at_the_ends_of_the_clip() -> None:
     assert 1 / 16 < tfstp_image(stream, 19)[0, 5] < 1 / 4, "dark since tick 4, but remembered"
 
 
-@pytest.mark.parametrize("radiance", [0.02, 0.11, 0.3, 0.77, 1.0])
-def test_constant_light_is_recovered_with_less_flicker_than_from_intervals(radiance: float) -> None:
-    """Ideal integrate-and-fire pixels of all phases, gain 0.6; also at the first and last ticks."""
-    phase = (np.arange(2000).reshape(40, 50) + 0.5) / 2000
-    charge = phase + 0.6 * radiance * np.arange(301)[:, None, None]
-    stream = stream_of(np.diff(np.floor(charge), axis=0).astype(np.uint8))
-    images = IMAGES["tfstp"](stream, [0, 1, 150, 298, 299], gain=0.6)
-    assert images.shape == (5, 40, 50) and images.dtype == np.float32
-    np.testing.assert_allclose(images.mean(axis=(1, 2)), radiance, rtol=0.03)
-    assert images[2].std() <= IMAGES["tfi"](stream, [150], gain=0.6)[0].std() * (1 + 1e-6)
-
-
 def test_it_lags_behind_a_change_of_light_and_arrives() -> None:
     """The memory is about F = 10 ticks: after the light halves, the rate falls from above, and is there in 60 ticks."""
     stream = one_row(200, [*range(0, 100, 2), *range(100, 200, 4)])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from resumed import same_tensors
 from toy_fits import silent
 from toy_world import GAIN, ToyWorld
 
@@ -29,20 +30,9 @@ from spike4dgs.method.starts.base import Start, measure
 from spike4dgs.method.training_views.training_images import TrainingImages
 
 WORLD = ToyWorld(width=40, height=25, n_ticks=80)
-SMALL = RadianceFieldSettings(
-    steps=220,
-    rays=128,
-    coarse_samples=24,
-    fine_samples=8,
-    depth=3,
-    width=32,
-    coarse_depth=2,
-    coarse_width=16,
-    position_frequencies=5,
-    direction_frequencies=1,
-    lr_field=1e-2,
-    lr_field_last=1e-3,
-)
+_SIZES = {"coarse_samples": 24, "fine_samples": 8, "depth": 3, "width": 32, "coarse_depth": 2, "coarse_width": 16}
+_RATES = {"position_frequencies": 5, "direction_frequencies": 1, "lr_field": 1e-2, "lr_field_last": 1e-3}
+SMALL = RadianceFieldSettings(steps=220, rays=128, **_SIZES, **_RATES)
 
 
 def plane(camera, t: float = 0.5, travel: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -162,10 +152,7 @@ def test_killed_and_resumed_gives_the_same_bits(step: int, tmp_path: Path) -> No
         Fitter(short(dies, path)).run(checkpoint_s=0)
     second = Fitter(short(silent, path))
     second.run()
-    result = tensors(second)
-    assert result.keys() == uninterrupted().keys()
-    for name, value in uninterrupted().items():
-        assert torch.equal(result[name], value), name
+    same_tensors(tensors(second), uninterrupted())
 
 
 def test_another_seed_gives_another_field_and_another_fits_checkpoint_is_refused(tmp_path: Path) -> None:

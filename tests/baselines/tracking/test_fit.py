@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from resumed import same_tensors
 from scipy.spatial.transform import Rotation, Slerp
 from toy_fits import silent
 from toy_world import ToyWorld
@@ -26,7 +27,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import FitJob
-from spike4dgs.method.gaussians.parameters import from_points
+from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.images.light import Light
 from spike4dgs.method.settings import override
 from spike4dgs.method.splat import Views
@@ -133,27 +134,29 @@ def test_the_background_is_fixed_or_hardly_moves() -> None:
     assert (soft.tracks.means[0, moving:] != soft.tracks.means[2, moving:]).any()
 
 
+def tracker_of(j: FitJob) -> Tracker:
+    g = from_points(j.start.points, j.start.values, opacity=0.5)
+    tracker = Tracker(j, g, foreground_masks(j.training_images.images))
+    tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
+    return tracker
+
+
 def test_only_the_window_is_rendered_and_the_gradient_is_that_of_the_whole_image() -> None:
     gradients = []
     for margin in (8, 1000):
         j = job(**TINY, margin_px=margin, ssim_weight=0.0)
-        g = from_points(j.start.points, j.start.values, opacity=0.5)
-        tracker = Tracker(j, g, foreground_masks(j.training_images.images))
-        tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
+        tracker = tracker_of(j)
         old = tracker.tracks.at(2)
         leaves = {k: v.clone().requires_grad_() for k, v in old.items()}
         tracker.loss(3, old)(leaves, [0, 3, 5]).backward()
         gradients.append([leaves[k].grad[: tracker.count] for k in ("means", "quats", "colors")])
-    assert Tracker(job(**TINY), g, foreground_masks(j.training_images.images)).share < 0.8
+    assert tracker_of(job(**TINY)).share < 0.8
     for a, b in zip(*gradients, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(b.abs().max()))
 
 
 def test_what_flies_off_to_where_nothing_moves_stays_where_it_was() -> None:
-    j = job(**TINY)
-    g = from_points(j.start.points, j.start.values, opacity=0.5)
-    tracker = Tracker(j, g, foreground_masks(j.training_images.images))
-    tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
+    tracker = tracker_of(job(**TINY))
     tracks = tracker.tracks
     tracks.means[1, 7] -= torch.tensor([0.0, 0.0, 0.45])  # from there its velocity takes it far above the board
     tracker.track(Visit(3, 2, 1))
@@ -188,8 +191,7 @@ def test_killed_at_any_time_and_resumed_gives_the_same_bits(time: str, tmp_path:
     seen: list[str] = []
     resumed = fit_tracking(job(path, lambda done, total, note="": seen.append(note), **TINY))
     assert any(note.startswith("loss") for note in seen) == (time == "loss")
-    for name, value in everything(uninterrupted()).items():
-        assert torch.equal(everything(resumed)[name], value), name
+    same_tensors(everything(resumed), everything(uninterrupted()))
 
 
 def test_finished_fit_is_read_back_and_another_fit_is_refused(tmp_path: Path) -> None:
@@ -230,12 +232,14 @@ def test_a_fit_in_mean_light_renders_the_light_of_its_instant(static: bool) -> N
         np.testing.assert_allclose(lit.render(WORLD.held_out, t_us), image, atol=1e-5)
 
 
+def six() -> Gaussians:
+    points = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+    return from_points(points, np.ones(6, np.float32), opacity=0.5)
+
+
 def tracks() -> Tracks:
     """Three times of four Gaussians that move along and turn about the y axis by 4 and then 2 degrees."""
-    g = from_points(
-        np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32), np.ones(6, np.float32), opacity=0.5
-    )
-    made = Tracks.start(g, torch.tensor([1, 4, 2, 5]), torch.tensor([5, 1, 4, 2, 0]), (10, 30, 40), 20000.0)
+    made = Tracks.start(six(), torch.tensor([1, 4, 2, 5]), torch.tensor([5, 1, 4, 2, 0]), (10, 30, 40), 20000.0)
     for i, (x, angle) in enumerate([(0.0, 0.0), (1.0, 4.0), (3.0, 6.0)]):
         half = np.deg2rad(angle) / 2
         quat = torch.tensor([np.cos(half), 0, np.sin(half), 0], dtype=torch.float32)
@@ -263,9 +267,7 @@ def test_rotations_between_times_are_those_of_slerp() -> None:
 
 
 def test_model_moves_only_its_own_gaussians_and_holds_the_clips_ends() -> None:
-    g = from_points(
-        np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32), np.ones(6, np.float32), opacity=0.5
-    )
+    g = six()
     model = TrackedModel(g, tracks(), duration_us=2500.0)
     now = model.at(1500.0)
     assert torch.equal(now.means[[0, 3]], g.means[[0, 3]]) and (now.means[[1, 2, 4, 5]] == 1).all()

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from resumed import same_tensors
 from safetensors.torch import load_file
 from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
@@ -206,8 +207,7 @@ def files(tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-
 def test_batches_are_functions_of_their_generator(files) -> None:  # type: ignore[no-untyped-def]
     a, b = (draw(files, SETTINGS, np.random.default_rng(5)) for _ in range(2))
     assert a.channels.shape == (4, 8, 24, 32) and a.spikes.shape == (4, 41, 24, 32)
-    for name in ("channels", "spikes", "truth", "moving"):
-        assert torch.equal(getattr(a, name), getattr(b, name))
+    assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("channels", "spikes", "truth", "moving"))
 
 
 def test_a_killed_training_goes_on_with_the_same_bits(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]
@@ -223,8 +223,7 @@ def test_a_killed_training_goes_on_with_the_same_bits(tmp_path: Path, files) -> 
     run(ImageNetworkTraining(files, TINY, SETTINGS, "cpu", 0), key, tmp_path / "parts")
     saved = [load_checkpoint(tmp_path / name / "checkpoint.safetensors", key) for name in ("whole", "parts")]
     assert saved[0] is not None and saved[1] is not None and saved[0].step == saved[1].step == 6
-    for name, tensor in saved[0].tensors.items():
-        assert torch.equal(tensor, saved[1].tensors[name]), name
+    same_tensors(saved[1].tensors, saved[0].tensors)
     card = WEIGHTS.read_card(tmp_path / "whole" / "images.safetensors")
     assert card.steps == 6 and len(card.trained_on) == 2
     (tmp_path / "parts" / "images.safetensors").unlink()
@@ -236,8 +235,7 @@ def test_a_training_begins_with_given_weights_and_their_shards(tmp_path: Path, f
     run(ImageNetworkTraining(files[:1], TINY, SETTINGS, "cpu", 0), training_key(TINY, SETTINGS, 0), tmp_path)
     weights = tmp_path / "images.safetensors"
     training = ImageNetworkTraining(files[1:], TINY, SETTINGS, "cpu", 0, weights)
-    for name, tensor in load_file(weights).items():
-        assert torch.equal(training.network.state_dict()[name], tensor.float()), name
+    same_tensors(training.network.state_dict(), {name: t.float() for name, t in load_file(weights).items()})
     assert training.step == 0 and all(p.requires_grad for p in training.network.parameters())
     run(training, training_key(TINY, SETTINGS, 0, "sha"), tmp_path / "on")
     assert len(WEIGHTS.read_card(tmp_path / "on" / "images.safetensors").trained_on) == 2

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from resumed import check_resumed, same_tensors
 from toy_bursts import write_toy_shard
 from toy_world import GAIN
 
@@ -34,11 +35,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Bursts:
     return Bursts(open_folder(folder))
 
 
-def same_weights(a: Training, b: Training) -> None:
-    for name, value in a.network.state_dict().items():
-        assert torch.equal(value, b.network.state_dict()[name]), name
-
-
 @pytest.fixture(scope="module")
 def trained(data: Bursts) -> tuple[Training, list[float], list[float]]:
     training = Training(data, TINY, FAST, "cpu", seed=1)
@@ -64,18 +60,7 @@ def test_random_weights_are_clearly_worse(data: Bursts, trained: tuple[Training,
 
 
 def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(data: Bursts, tmp_path: Path) -> None:
-    whole, first, second = (Training(data, TINY, FAST, "cpu", seed=2) for _ in range(3))
-    losses = [whole.train_step() for _ in range(6)]
-    torch.rand(3)  # other random numbers do not matter
-    for _ in range(3):
-        first.train_step()
-    first.save(tmp_path / "c.safetensors", "key")
-    second.resume(tmp_path / "c.safetensors", "key")
-    assert second.step == 3
-    assert [second.train_step() for _ in range(3)] == losses[3:]
-    same_weights(whole, second)
-    with pytest.raises(UserError, match="another fit's"):
-        second.resume(tmp_path / "c.safetensors", "another key")
+    check_resumed(lambda: Training(data, TINY, FAST, "cpu", seed=2), tmp_path / "c.safetensors")
 
 
 def test_checkpoints_of_earlier_versions_are_resumed() -> None:
@@ -100,8 +85,7 @@ def test_a_step_without_a_finite_gradient_changes_nothing(data: Bursts, monkeypa
     monkeypatch.setattr("spike4dgs.method.msdi.train.point_loss", lambda p, c, t: (c * float("inf")).sum())
     training.train_step()
     assert training.step == 1
-    for name, value in training.network.state_dict().items():
-        assert torch.equal(value, before[name]), name
+    same_tensors(training.network.state_dict(), before)
 
 
 # ---------------------------------------------------------------- scores
@@ -245,9 +229,7 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
 
     network = Msdi(TINY)
     start_from(network, path)
-    loaded = load_network(path, "cpu").state_dict()
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, loaded[name]), name
+    same_tensors(network.state_dict(), load_network(path, "cpu").state_dict())
     with pytest.raises(UserError, match="expected the tensors of Fast3R or DUSt3R, found others"):
         start_from(Msdi(replace(TINY, encoder_layers=1)), path)
 
