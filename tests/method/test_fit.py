@@ -37,7 +37,6 @@ def psnr(name: str, moving: bool) -> float:
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_deforming_scene_beats_a_static_one_and_the_nearest_view(moving: bool) -> None:
     ours, static, nearest = (psnr(name, moving) for name in ("tfp+4dgs", "tfp+static", "nearest-view"))
-    print(f"moving={moving}: tfp+4dgs {ours:.2f}, tfp+static {static:.2f}, nearest-view {nearest:.2f} dB")
     assert ours > nearest + 3
     assert ours > static + (2 if moving else 0.5)
 

@@ -50,11 +50,9 @@ def uneven_scene(dead_ticks: float = 0.0, light=light, n_ticks: int = TICKS) -> 
 
 
 def error(scene, **settings):
-    images = make_training_images(
-        scene, scene.cameras, IMAGES["adaptive"], ImageSettings(**settings), "cpu"
-    ).images.numpy()
+    made = make_training_images(scene, scene.cameras, IMAGES["adaptive"], ImageSettings(**settings), "cpu")
     truth = np.stack([light(c) for c in scene.cameras])
-    return float(np.sqrt(np.mean((images - truth) ** 2)))
+    return float(np.sqrt(np.mean((made.images.numpy() - truth) ** 2)))
 
 
 def test_images_lose_the_pattern_of_the_pixels(scene):

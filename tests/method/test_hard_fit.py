@@ -1,5 +1,6 @@
 """Fits of streams that hold nothing, everything, the same thing, or too little: no NaN and no Inf anywhere."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -60,40 +61,43 @@ def holes(value: float) -> np.ndarray:
     return np.where(np.random.default_rng(1).random((HEIGHT, WIDTH)) < 0.2, value, 1.0)
 
 
+def first_views(scene: TrainingScene, count: int) -> TrainingScene:
+    return replace(scene, **{part: getattr(scene, part)[:count] for part in ("cameras", "streams", "recordings")})
+
+
+def half_dark() -> np.ndarray:
+    seen = usual().streams[0].window(0, TICKS).astype(bool)
+    seen[:, :, : WIDTH // 2] = False
+    return seen
+
+
+def long() -> TrainingScene:
+    tile = stream(np.random.default_rng(0).random((100, HEIGHT, WIDTH)) < 0.3)
+    tiled, few = replace(tile, packed=np.tile(tile.packed, (1000, 1))), first_views(usual(), 3)
+    return replace(few, streams=(tiled,) * 3, n_ticks=tiled.n_ticks)
+
+
+EMPTY, ONES = np.zeros((TICKS, HEIGHT, WIDTH), bool), np.ones((HEIGHT, WIDTH))
+NOISE = np.random.default_rng(0).random((1, HEIGHT, WIDTH)) < 0.5
+MADE: dict[str, Callable[[], TrainingScene]] = {
+    "all dark": lambda: with_streams(EMPTY),
+    "saturated": lambda: with_streams(~EMPTY),
+    "identical frames": lambda: with_streams(np.broadcast_to(NOISE, EMPTY.shape)),
+    "a camera that saw nothing": lambda: with_streams(EMPTY, 1),
+    "a camera that was blinded": lambda: with_streams(~EMPTY, 1),
+    "dark half": lambda: with_streams(half_dark()),
+    "one tick": lambda: with_streams(NOISE),
+    "100,000 ticks": long,
+    "NaN gain": lambda: calibrated(usual(), holes(np.nan), 0 * ONES),
+    "NaN dark rate": lambda: calibrated(usual(), ONES, holes(np.nan) - 1),
+    "dead pixels": lambda: calibrated(usual(), holes(0.0), 0 * ONES),
+    "one view": lambda: first_views(usual(), 1),
+}
+
+
 @cache
 def case(name: str) -> TrainingScene:
-    empty = np.zeros((TICKS, HEIGHT, WIDTH), bool)
-    if name == "all dark":
-        return with_streams(empty)
-    if name == "saturated":
-        return with_streams(~empty)
-    if name == "identical frames":
-        return with_streams(np.broadcast_to(np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.5, empty.shape))
-    if name == "a camera that saw nothing":
-        return with_streams(empty, 1)
-    if name == "a camera that was blinded":
-        return with_streams(~empty, 1)
-    if name == "one view":
-        scene = usual()
-        one = {part: getattr(scene, part)[:1] for part in ("cameras", "streams", "recordings")}
-        return replace(scene, **one)
-    if name == "dark half":
-        seen = usual().streams[0].window(0, TICKS).astype(bool)
-        seen[:, :, : WIDTH // 2] = False
-        return with_streams(seen)
-    if name == "one tick":
-        return with_streams(np.random.default_rng(0).random((1, HEIGHT, WIDTH)) < 0.5)
-    if name == "100,000 ticks":
-        tile = stream(np.random.default_rng(0).random((100, HEIGHT, WIDTH)) < 0.3)
-        long, scene = replace(tile, packed=np.tile(tile.packed, (1000, 1))), usual()
-        few = {part: getattr(scene, part)[:3] for part in ("cameras", "recordings")}
-        return replace(scene, streams=(long,) * 3, n_ticks=long.n_ticks, **few)
-    if name == "NaN gain":
-        return calibrated(usual(), holes(np.nan), np.zeros((HEIGHT, WIDTH)))
-    if name == "NaN dark rate":
-        return calibrated(usual(), np.ones((HEIGHT, WIDTH)), holes(np.nan) - 1)
-    assert name == "dead pixels"
-    return calibrated(usual(), holes(0.0), np.zeros((HEIGHT, WIDTH)))
+    return MADE[name]()
 
 
 @cache
@@ -108,10 +112,6 @@ def seen(name: str, images: str, device: str) -> TrainingImages:
     return make_training_images(scene, scene.cameras, IMAGES[images], FEW, device)
 
 
-CASES = [
-    "all dark", "saturated", "identical frames", "a camera that saw nothing", "a camera that was blinded", "dark half",
-    "one tick", "100,000 ticks", "NaN gain", "NaN dark rate", "dead pixels", "one view",
-]  # fmt: skip
 FITS = [
     ("intervals", "paths", "pixel", {"freeze_background": True}, {}),
     ("intervals", "paths", "fixed-pattern", {"freeze_background": True}, {"first": 1, "every": 1}),
@@ -127,7 +127,7 @@ FITS = [
     twin="finite losses, gradients, parameters and images", unit="values that are not finite", on_device=True,
 )  # fmt: skip
 @pytest.mark.parametrize("images, motion, supervision, extra, loss", FITS, ids=["+".join(f[:3]) for f in FITS])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", MADE)
 def test_losses_gradients_and_parameters_are_numbers(
     hard_case: HardCase, name, images, motion, supervision, extra, loss
 ) -> None:

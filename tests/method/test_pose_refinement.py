@@ -197,10 +197,9 @@ def test_refinement_never_ends_worse_than_it_began() -> None:
 
 
 def test_refinement_without_background_pixels_is_refused() -> None:
+    dark, nowhere = np.zeros((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), bool)
     with pytest.raises(UserError, match="0 background pixels"):
-        refine_pose(
-            render_view, TRUE, np.zeros((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), bool), 1, Refinement()
-        )
+        refine_pose(render_view, TRUE, dark, nowhere, 1, Refinement())
 
 
 @given(st.sets(st.integers(0, 59), max_size=30), st.integers(60, 400))
@@ -286,13 +285,8 @@ def test_a_recipe_on_shifted_poses_scores_better_refined(motion: str) -> None:
         cameras = tuple(replace(c, t=c.t - c.R @ shift) for c in request.scene.cameras)
         return rig(replace(request.scene, cameras=cameras))
 
-    parts = Parts(
-        IMAGES,
-        {"shifted": Initialization(shifted, estimates_poses=True)},
-        MOTIONS,
-        SUPERVISIONS,
-        {"tracking": TRACKING},
-    )
+    starts = {"shifted": Initialization(shifted, estimates_poses=True)}
+    parts = Parts(IMAGES, starts, MOTIONS, SUPERVISIONS, {"tracking": TRACKING})
     steps = {"trainer.coarse_steps": 60} if motion == "static" else {"motion.first_steps": 60, "motion.later_steps": 2}
     recipe = Recipe("posed", "tfp", "shifted", motion, "pixel", steps)
     method = RecipeMethod(recipe, parts)

@@ -41,9 +41,8 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     tmp_path = tmp_path_factory.mktemp("speed")
     makers = {name: IMAGES[name] for name in ("tfp", "tfi", "tfstp")}
     with pytest.MonkeyPatch.context() as monkeypatch:
-        use(
-            monkeypatch, {**makers, "spk2img": ImageMaker(name="spk2img", definition="", source="", rate=needs_weights)}
-        )
+        absent = ImageMaker(name="spk2img", definition="", source="", rate=needs_weights)
+        use(monkeypatch, {**makers, "spk2img": absent})
         scenes = [str(write_small_scene(tmp_path / f"s{i}", seed=i)) for i in range(2)]
         assert main(["speed", "images", *scenes, "--repeats", "1", "--out", str(tmp_path / "out")]) == 0
         yield tmp_path / "out"
@@ -60,12 +59,8 @@ def test_each_maker_has_a_row_with_times_scores_and_the_papers_numbers(measured:
     for name in ("tfp", "tfi", "tfstp"):
         assert all(float(table[name][c]) > 0 for c in ("ms 40x24", "PSNR", "SSIM", "PSNR, moving")), name
     published = [(row["in Table 6"], row["its PSNR"], row["its SSIM"]) for row in table.values()]
-    assert published == [
-        ("TFP", "25.37", "0.852"),
-        ("TFI", "24.51", "0.850"),
-        ("TVS", "22.43", "0.821"),
-        ("Spike2img", "30.76", "0.904"),
-    ]
+    assert published[:2] == [("TFP", "25.37", "0.852"), ("TFI", "24.51", "0.850")]
+    assert published[2:] == [("TVS", "22.43", "0.821"), ("Spike2img", "30.76", "0.904")]
     assert "stands in for TVS" in table["tfstp"]["note"]
     absent = table["spk2img"]
     assert absent["note"] == "net.safetensors: expected weights, found no such file; train them"
@@ -77,13 +72,8 @@ def test_scores_are_those_of_the_held_out_streams_images(measured: Path) -> None
     psnr, ssim = [], []
     for i in range(2):
         scene = open_scene(measured.parent / f"s{i}")
-        pairs = [
-            (
-                np.clip(scene.ground_truth(t).astype(float), 0, 1),
-                np.clip(TFP(scene.stream("cam_03"), [t.tick], GAIN)[0].astype(float), 0, 1),
-            )
-            for t in scene.targets
-        ]
+        shown = [(scene.ground_truth(t), TFP(scene.stream("cam_03"), [t.tick], GAIN)[0]) for t in scene.targets]
+        pairs = [np.clip(pair, 0, 1).astype(float) for pair in shown]
         psnr.append(np.mean([peak_signal_noise_ratio(*pair, data_range=1) for pair in pairs]))
         options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
         ssim.append(np.mean([structural_similarity(*pair, **options) for pair in pairs]))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_fits import silent
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
@@ -20,10 +21,6 @@ from spike4dgs.studies.oracle_truth import Truth, find_truth
 
 TICKS, SAMPLES = (10, 70), 16
 MIDDLE = 40  # of 80 ticks: a target of the held-out camera
-
-
-def silent(done: int, total: int, note: str = "") -> None:
-    pass
 
 
 @pytest.fixture(scope="module")

@@ -16,12 +16,8 @@ from spike4dgs.studies.spike_agreement import correlations, means, partner
 
 def test_correlations_are_spearmans_and_deviances_count_backwards() -> None:
     rows = {"a": (20.0, 16.0, 3.0), "b": (30.0, 16.4, 1.0), "c": (28.0, 16.5, 2.0), "d": (35.0, 16.6, 0.1)}
-    scores = {
-        "s": {
-            name: dict.fromkeys(METRICS) | {"psnr": true, "spike_psnr_5": psnr, "spike_deviance": deviance}
-            for name, (true, psnr, deviance) in rows.items()
-        }
-    }
+    names = ("psnr", "spike_psnr_5", "spike_deviance")
+    scores = {"s": {m: dict.fromkeys(METRICS) | dict(zip(names, row, strict=True)) for m, row in rows.items()}}
     found = correlations(scores)
     expected = spearmanr([r[0] for r in rows.values()], [r[1] for r in rows.values()]).statistic
     assert found["spike_psnr_5"]["s"] == pytest.approx(expected) == pytest.approx(0.8)
@@ -35,24 +31,16 @@ def test_a_run_becomes_a_table_and_a_plot(small_scene: Path, tmp_path: Path, cap
     data = tmp_path / "data"
     data.mkdir()
     shutil.move(small_scene, data / "pattern-0")
-    run(
-        tmp_path / "run",
-        [data / "pattern-0"],
-        CountMethod("fine"),
-        CountMethod("rough", steps=1),
-        CountMethod("mid", steps=2),
-    )
+    methods = (CountMethod("fine"), CountMethod("rough", steps=1), CountMethod("mid", steps=2))
+    run(tmp_path / "run", [data / "pattern-0"], *methods)
     shutil.copytree(tmp_path / "run/predictions/fine/pattern-0", tmp_path / "run/predictions/fine/unknown-0")
     out = tmp_path / "out"
     assert main(["spike-agreement", str(tmp_path / "run"), "--data", str(data), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "left out: fine on unknown-0" in said and "spike_psnr_20: " in said
     values = json.loads((out / "agreement.json").read_text())
-    assert set(values["correlations"]) == set(SPIKE_METRICS) and set(values["scores"]["pattern-0"]) == {
-        "fine",
-        "rough",
-        "mid",
-    }
+    assert set(values["correlations"]) == set(SPIKE_METRICS)
+    assert set(values["scores"]["pattern-0"]) == {"fine", "rough", "mid"}
     with open(out / "agreement.csv", newline="") as f:
         rows = {row["method"]: row for row in csv.DictReader(f)}
     assert float(rows["fine"]["spike_psnr_5"]) == values["scores"]["pattern-0"]["fine"]["spike_psnr_5"]

@@ -32,10 +32,9 @@ ROWS = ("tfp+stg", "tfi+4dgs", "spk2img+d3dgs", "dy-spikenerf", "spike4dgs", "sp
 @pytest.mark.parametrize("name", ROWS)
 def test_the_first_trial_is_the_recipe_as_it_is(name):
     method = get_method(name)
-    assert (
-        override(method.settings, as_settings(start_of(method.settings), method.settings), "start") == method.settings
-    )
-    assert variant(method, start_of(method.settings)) is method
+    settings = method.settings
+    assert override(settings, as_settings(start_of(settings), settings), "start") == settings
+    assert variant(method, start_of(settings)) is method
 
 
 def test_every_recipe_lies_in_the_space_of_its_search():
@@ -57,10 +56,10 @@ def test_views_of_a_step_change_only_where_the_number_of_steps_can_follow():
 @given(data=st.data())
 def test_no_knob_gives_more_work_or_knowledge(name, data):
     method = get_method(name)
-    knobs = {
-        k.name: data.draw(st.sampled_from(k.choices) if k.choices else st.floats(k.low, k.high), label=k.name)
-        for k in knobs_of(method.settings)
-    }
+    knobs = {}
+    for knob in knobs_of(method.settings):
+        values = st.sampled_from(knob.choices) if knob.choices else st.floats(knob.low, knob.high)
+        knobs[knob.name] = data.draw(values, label=knob.name)
     changed = variant(method, knobs)
 
     def work(m):
