@@ -170,13 +170,8 @@ def test_windows_of_images() -> None:
 def test_a_recipe_is_given_what_it_takes() -> None:
     given = {recipe.name: METHODS[recipe.name].given for recipe in SENSORS}  # type: ignore[attr-defined]
     frames, events = ("poses", "frames"), ("poses", "frames", "events")
-    assert given == {
-        "rgb+stg": frames,
-        "rgb+4dgs": frames,
-        "rgb-deblur+stg": frames,
-        "edi+stg": events,
-        "edi+4dgs": events,
-    }
+    of_frames, of_events = ("rgb+stg", "rgb+4dgs", "rgb-deblur+stg"), ("edi+stg", "edi+4dgs")
+    assert given == dict.fromkeys(of_frames, frames) | dict.fromkeys(of_events, events)
     for changed in ({"initialization": "msdi"}, {"supervision": "spss"}, {"settings": {"images.flat_field": True}}):
         with pytest.raises(UserError, match="recipe edi.stg: expected parts that take nothing of spikes"):
             RecipeMethod(replace(next(r for r in SENSORS if r.name == "edi+stg"), **changed), PARTS)

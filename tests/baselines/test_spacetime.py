@@ -13,20 +13,8 @@ from small_scenes import array_cameras
 from torch import Tensor
 from toy_world import ToyWorld
 
+from spike4dgs.baselines import spacetime
 from spike4dgs.baselines.recipes import PARTS
-from spike4dgs.baselines.spacetime import (
-    BAD_PIXELS,
-    PATCH,
-    Decoder,
-    Spacetime,
-    SpacetimeLite,
-    SpacetimeSettings,
-    _render,
-    along_rays,
-    bad_pixels,
-    guide,
-    rays,
-)
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.parameters import Gaussians, concatenate, densify, prune, relocate
@@ -43,12 +31,12 @@ MOTIONS = PARTS.motion
 
 WORLD = ToyWorld(width=64, height=40, side=2, n_ticks=200)
 EXTENT = Extent(-torch.ones(3), torch.ones(3), 2.0, 200, 64)
-SETTINGS = SpacetimeSettings()
+SETTINGS = spacetime.SpacetimeSettings()
 
 
-def motion(name: str = "spacetime") -> SpacetimeLite:
+def motion(name: str = "spacetime") -> spacetime.SpacetimeLite:
     made = MOTIONS[name](EXTENT, MOTIONS[name].defaults, seeded(0, -1))
-    assert isinstance(made, SpacetimeLite)
+    assert isinstance(made, spacetime.SpacetimeLite)
     return made
 
 
@@ -166,7 +154,7 @@ def test_relocated_gaussians_keep_their_hosts_times() -> None:
 def test_rays_project_to_their_pixels(lens: tuple[float, ...]) -> None:
     first, second = array_cameras(2)
     cameras = [first, replace(second, distortion=lens)]
-    origin, direction = rays(Views.from_cameras(cameras))
+    origin, direction = spacetime.rays(Views.from_cameras(cameras))
     for i, camera in enumerate(cameras):
         np.testing.assert_allclose(origin[i].numpy(), camera.center, atol=1e-12)
         d = direction[i].double().numpy().T
@@ -181,7 +169,7 @@ def test_decoder_is_two_pointwise_layers_beside_the_albedo() -> None:
     cameras = array_cameras(2)
     views = Views.from_cameras(cameras)
     center = torch.tensor([0.1, -0.2, 0.3])
-    decoder = Decoder(center, 1.7, torch.Generator().manual_seed(0))
+    decoder = spacetime.Decoder(center, 1.7, torch.Generator().manual_seed(0))
     channels = torch.rand(2, views.height, views.width, 3, generator=torch.Generator().manual_seed(1))
     assert torch.equal(decoder(channels, views), channels[..., 0])  # it starts as the albedo
     with torch.no_grad():
@@ -244,7 +232,7 @@ def test_groups_and_learning_rates_name_every_parameter() -> None:
     full, lite = motion(), motion("spacetime-lite")
     g = full.timed(cloud(4), torch.zeros(4), 1.0)
     assert set(full.learning_rates()) == set(g.extra) and set(lite.learning_rates()) == set(g.extra) - {"features"}
-    assert isinstance(full, Spacetime) and set(full.groups()) == {"decoder"} and not lite.groups()
+    assert isinstance(full, spacetime.Spacetime) and set(full.groups()) == {"decoder"} and not lite.groups()
     assert full.groups()["decoder"][0] == list(full.decoder.parameters())
 
 
@@ -264,7 +252,7 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
 def test_pixels_of_bad_patches_are_sampled_and_the_border_is_not() -> None:
     rendered, image = images()
     chosen = np.zeros((HEIGHT, WIDTH), bool)
-    chosen.flat[bad_pixels(rendered, image).numpy()] = True
+    chosen.flat[spacetime.bad_pixels(rendered, image).numpy()] = True
     expected = np.zeros_like(chosen)
     expected[32:48, 48:64] = True
     expected[8:16, 10:16] = True  # what a tenth of the image leaves of the other patch
@@ -274,16 +262,17 @@ def test_pixels_of_bad_patches_are_sampled_and_the_border_is_not() -> None:
 
 def test_exposure_does_not_make_pixels_bad() -> None:
     rendered, image = images()
-    assert torch.equal(bad_pixels(rendered * 3, image), bad_pixels(rendered, image))
+    assert torch.equal(spacetime.bad_pixels(rendered * 3, image), spacetime.bad_pixels(rendered, image))
 
 
 def test_a_patch_needs_85_percent_of_bad_pixels() -> None:
-    image = torch.ones(PATCH * 4, PATCH * 4)
+    side = spacetime.PATCH
+    image = torch.ones(side * 4, side * 4)
     for bad, found in ((0.8, False), (0.9, True)):
         rendered = image.clone()
-        rendered[PATCH : PATCH + round(bad * PATCH), PATCH : 2 * PATCH] = 2.0
-        assert bool(len(bad_pixels(rendered, image))) == found
-    assert BAD_PIXELS == 0.6
+        rendered[side : side + round(bad * side), side : 2 * side] = 2.0
+        assert bool(len(spacetime.bad_pixels(rendered, image))) == found
+    assert spacetime.BAD_PIXELS == 0.6
 
 
 def wall(camera: Camera, distance: float) -> Splats:
@@ -301,17 +290,22 @@ def test_points_lie_on_their_pixels_rays_at_the_depths_that_the_view_shows() -> 
     views = Views.from_cameras([camera])
     out = render(wall(camera, 2.0), views, depth=True)
     pixels = torch.tensor([100, 333, 517])
-    points = along_rays(views, pixels, out, torch.Generator().manual_seed(0))
+    points = spacetime.along_rays(views, pixels, out, torch.Generator().manual_seed(0))
     uv, z = camera.project(points.double().numpy())
     centres = np.stack([pixels % camera.width, pixels // camera.width], -1) + 0.5
     np.testing.assert_allclose(uv, np.tile(centres, (2, 1)), atol=1e-3)
     assert (np.abs(z - 2.0) < 0.05 * 2.0 + 0.1).all() and len(set(np.round(z, 4))) == 6
 
 
+def lite() -> spacetime.SpacetimeLite:
+    extent = Extent(-torch.ones(3), torch.ones(3), 2.0, 100, WIDTH)
+    return spacetime.SpacetimeLite(extent, spacetime.SpacetimeLite.defaults, seeded(0, 0))
+
+
 def test_a_model_that_equals_its_images_has_no_bad_pixels_by_the_filter_of_the_fit() -> None:
     """By another one its edges look wrong."""
     camera = array_cameras(2, width=WIDTH, height=HEIGHT)
-    motion = SpacetimeLite(Extent(-torch.ones(3), torch.ones(3), 2.0, 100, WIDTH), SpacetimeLite.defaults, seeded(0, 0))
+    motion = lite()
     s = wall(camera[0], 2.5)
     thin = Gaussians(s.means, (s.scales * 0.3).log(), s.quats, torch.full((len(s),), 4.0), s.colors)
     g, views = motion.timed(thin, torch.full((len(thin),), 0.5), 1e6), Views.from_cameras(camera)
@@ -320,37 +314,35 @@ def test_a_model_that_equals_its_images_has_no_bad_pixels_by_the_filter_of_the_f
     images = TrainingImages(views, (50,), truth[None], 100)
     errors = []
     for motion.pixel_filter in (sharp, CUSTOMARY):
-        _, image = _render(motion, g, images, 1, 0.5)
+        _, image = spacetime._render(motion, g, images, 1, 0.5)
         errors.append(float((image - truth[1]).abs().max()))
     assert errors[0] == 0 < errors[1]
 
 
 def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     cameras = array_cameras(4, width=WIDTH, height=HEIGHT)
-    extent = Extent(-torch.ones(3), torch.ones(3), 2.0, 100, WIDTH)
-    motion = SpacetimeLite(extent, SpacetimeLite.defaults, seeded(0, 0))
+    motion = lite()
     s = wall(cameras[0], 2.5)
     plain = Gaussians(s.means, s.scales.log(), s.quats, torch.full((len(s),), 4.0), s.colors)
-    views = Views.from_cameras(cameras)
-    ticks = (10, 50, 90)
+    views, ticks = Views.from_cameras(cameras), (10, 50, 90)
     right = render(plain.splats(), views).image[..., 0]
     truth = right.expand(3, -1, -1, -1).clone()
     truth[2, 1, 32:64, 32:64] = torch.rand(32, 32, generator=torch.Generator().manual_seed(0))
     truth[0, 3, 32:48, 32:64] = torch.rand(16, 32, generator=torch.Generator().manual_seed(1))
     g = motion.timed(plain, torch.full((len(plain),), 0.5), 1e6)
-    new = guide(motion, g, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
+    images = TrainingImages(views, ticks, truth, 100)
+    new = spacetime.guide(motion, g, images, torch.Generator().manual_seed(0))
     assert [t for _, t in new] == [0.9, 0.1]
     uv, _ = cameras[1].project(new[0][0].means.double().numpy())
     assert (uv > 32).all() and (uv < 64).all()
-    more = motion.guided_samples(g, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
+    more = motion.guided_samples(g, images, torch.Generator().manual_seed(0))
     assert len(more) == len(g) + sum(len(x) for x, _ in new)
     lamp = replace(g, colors=torch.cat([g.colors, torch.ones_like(g.colors)], dim=1))
-    beside = motion.guided_samples(lamp, TrainingImages(views, ticks, truth, 100), torch.Generator().manual_seed(0))
+    beside = motion.guided_samples(lamp, images, torch.Generator().manual_seed(0))
     assert beside.colors.shape[1] == 2 and not beside.colors[len(g) :, 1].any(), "new ones have no share of a lamp yet"
     missing = torch.zeros(3, 4, dtype=torch.bool)
     missing[2, 1] = True
-    lacking = TrainingImages(views, ticks, truth, 100, missing=missing)
-    assert [t for _, t in guide(motion, g, lacking, torch.Generator().manual_seed(0))] == [0.1], "nothing was measured"
-    assert torch.equal(more.means[: len(g)], g.means) and set(more.extra["times"][len(g) :].tolist()) == {
-        torch.tensor(t).item() for t in (0.9, 0.1)
-    }
+    new = spacetime.guide(motion, g, replace(images, missing=missing), torch.Generator().manual_seed(0))
+    assert [t for _, t in new] == [0.1], "nothing was measured"
+    assert torch.equal(more.means[: len(g)], g.means)
+    assert set(more.extra["times"][len(g) :].tolist()) == set(torch.tensor([0.9, 0.1]).tolist())

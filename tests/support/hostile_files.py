@@ -301,16 +301,10 @@ def make_imports(folder: Path) -> None:
                 file.write(key, value)
             file.endWriteStruct()
         file.release()
-    chain: dict[str, Any] = {
-        c.id: {
-            "camera_model": "pinhole",
-            "intrinsics": [c.fx, c.fy, c.cx, c.cy],
-            "distortion_model": "radtan",
-            "distortion_coeffs": [0.01, 0.0, 0.0, 0.0],
-            "resolution": [WIDTH, HEIGHT],
-        }
-        for c in cameras
-    }
+    chain: dict[str, Any] = {c.id: {"camera_model": "pinhole", "distortion_model": "radtan"} for c in cameras}
+    for c in cameras:
+        chain[c.id] |= {"intrinsics": [c.fx, c.fy, c.cx, c.cy], "resolution": [WIDTH, HEIGHT]}
+        chain[c.id]["distortion_coeffs"] = [0.01, 0.0, 0.0, 0.0]
     chain[cameras[1].id]["T_cn_cnm1"] = (cameras[1].w2c @ cameras[0].c2w).tolist()
     (folder / "kalibr.yaml").write_text(yaml.safe_dump(chain))
     (folder / "spikecv").mkdir()

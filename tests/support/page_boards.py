@@ -19,21 +19,10 @@ def cell(scores: dict[str, np.ndarray], **costs: Any) -> dict[str, Any]:
         f"cam_03/{20 * i:06d}": {m: float(scores[m][i]) if m in scores else None for m in METRICS} for i in range(n)
     }
     means = {m: float(np.mean(scores[m])) if m in scores else None for m in METRICS}
-    plain = {"fit_seconds": 50.0, "render_fps": 100.0, "peak_memory_mb": 900.0, "model_mb": 2.5}
-    return {
-        "status": "ok",
-        "error": None,
-        "metrics": means,
-        "per_image": images,
-        "notes": {},
-        "gain_aligned": 1.0,
-        "predictions_sha256": "a" * 64,
-        "budget": 1.0,
-        "device": "cpu",
-        "fitted_with": {"environment": MACHINE, "harness": CODE},
-        **plain,
-        **costs,
-    }
+    plain = {"fit_seconds": 50.0, "render_fps": 100.0, "peak_memory_mb": 900.0, "model_mb": 2.5, "notes": {}}
+    made = {"status": "ok", "error": None, "metrics": means, "per_image": images, "gain_aligned": 1.0}
+    made |= {"predictions_sha256": "a" * 64, "budget": 1.0, "device": "cpu"}
+    return {**made, "fitted_with": {"environment": MACHINE, "harness": CODE}, **plain, **costs}
 
 
 def failed(error: str = "no luck") -> dict[str, Any]:
@@ -45,23 +34,11 @@ def failed(error: str = "no luck") -> dict[str, Any]:
 def row(name: str, cells: dict[str, dict[str, Any]], **changes: Any) -> Row:
     """A row of one record; `changes` replace fields of the record's method, or `label`, `ranked` and `why`."""
     facts = {key: changes.pop(key) for key in ("label", "ranked", "why") if key in changes}
-    method = {
-        "name": name,
-        "version": "1",
-        "params": {"images": "tfp", "initialization": "rig", "motion": "static", "supervision": "pixel"},
-        "seed": 0,
-        "trained_on": [],
-        "given": ["poses"],
-    }
-    record = {
-        "method": method | changes,
-        "dataset": {"split": "center"},
-        "scenes": cells,
-        "environment": MACHINE,
-        "harness": CODE,
-        "command": f"spike4dgs run-benchmark --methods {name}",
-        "created": "2026-11-21T00:00:00Z",
-    }
+    params = {"images": "tfp", "initialization": "rig", "motion": "static", "supervision": "pixel"}
+    method = {"name": name, "version": "1", "params": params, "seed": 0, "trained_on": [], "given": ["poses"]}
+    record = {"method": method | changes, "dataset": {"split": "center"}, "scenes": cells}
+    record |= {"command": f"spike4dgs run-benchmark --methods {name}", "created": "2026-11-21T00:00:00Z"}
+    record |= {"environment": MACHINE, "harness": CODE}
     ranked = all(c["status"] == "ok" for c in cells.values())
     return Row(**({"name": name, "label": "re-scored", "ranked": ranked, "why": "", "records": (record,)} | facts))
 

@@ -32,24 +32,11 @@ def source_scene(root: Path, cameras: int = 9, ticks: int = TICKS) -> Scene:
         with SpikeWriter(root / stream_name(camera.id), WIDTH, HEIGHT) as writer:
             writer.write(pack(rng.random((ticks, HEIGHT, WIDTH)) < 0.4))
     names, held_out = [c.id for c in poses], poses[cameras // 2].id
-    finish_scene(
-        root,
-        SceneDescription(
-            id="noise",
-            title="Noise",
-            licence="CC0-1.0",
-            cameras=poses,
-            train=tuple(n for n in names if n != held_out),
-            test=(held_out,),
-            rate_hz=20000.0,
-            n_ticks=ticks,
-            radiance_gain=0.6,
-            targets=(),
-            sensor={"model": "noise/1", "rows_bottom_up": True},
-            source={"kind": "test"},
-            splits=standard_splits(poses, held_out),
-        ),
-    )
+    about = {"id": "noise", "title": "Noise", "licence": "CC0-1.0", "source": {"kind": "test"}, "targets": ()}
+    sensor = {"model": "noise/1", "rows_bottom_up": True}
+    clock = {"rate_hz": 20000.0, "n_ticks": ticks, "radiance_gain": 0.6, "sensor": sensor}
+    array = {"cameras": poses, "train": tuple(n for n in names if n != held_out), "test": (held_out,)}
+    finish_scene(root, SceneDescription(**about, **clock, **array, splits=standard_splits(poses, held_out)))
     return open_scene(root)
 
 

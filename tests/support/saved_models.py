@@ -30,21 +30,11 @@ LOW, HIGH = torch.tensor([-1.5, -0.5, 0.0]), torch.tensor([1.5, 1.0, 1.5])
 
 def provenance(**changes: Any) -> Provenance:
     """Of a fit to the toy world."""
-    values = {
-        "method": {"name": "toy+4dgs", "version": "0", "params": {}, "seed": 0, "trained_on": []},
-        "scene": "toy",
-        "scene_revision": "0" * 64,
-        "split": "center",
-        "cameras": WORLD.cameras,
-        "rate_hz": RATE_HZ,
-        "n_ticks": WORLD.n_ticks,
-        "radiance_gain": GAIN,
-        "budget": 1.0,
-        "device": "cpu",
-        "fit_seconds": 1.5,
-        "harness": {"version": "0", "commit": None, "dirty": None},
-        "created": "2026-01-31T12:00:00Z",
-    }
+    method = {"name": "toy+4dgs", "version": "0", "params": {}, "seed": 0, "trained_on": []}
+    scene = {"scene": "toy", "scene_revision": "0" * 64, "split": "center", "cameras": WORLD.cameras}
+    clock = {"rate_hz": RATE_HZ, "n_ticks": WORLD.n_ticks, "radiance_gain": GAIN}
+    fit = {"budget": 1.0, "device": "cpu", "fit_seconds": 1.5, "created": "2026-01-31T12:00:00Z"}
+    values = {"method": method, **scene, **clock, **fit, "harness": {"version": "0", "commit": None, "dirty": None}}
     return Provenance(**{**values, **changes})
 
 

@@ -29,14 +29,8 @@ def keys_of(world: ToyWorld, camera: Camera) -> tuple[np.ndarray, tuple[int, ...
 def record(world: ToyWorld, root: Path, threshold: float) -> TrainingScene:
     """Write frames and events of the training cameras below `root`; return the world's scene with them."""
     scene = world.training
-    meta: dict[str, Any] = {
-        "rate_hz": RATE_HZ,
-        "n_ticks": world.n_ticks,
-        "width": world.width,
-        "height": world.height,
-        "conventional": {"fps": FPS, "exposure_s": EXPOSURE_S},
-        "events": {"threshold": threshold},
-    }
+    meta: dict[str, Any] = {"rate_hz": RATE_HZ, "n_ticks": world.n_ticks, "width": world.width, "height": world.height}
+    meta |= {"conventional": {"fps": FPS, "exposure_s": EXPOSURE_S}, "events": {"threshold": threshold}}
     for camera in scene.cameras:
         keys, ticks = keys_of(world, camera)
         for tick, image in exposures(keys, ticks, world.n_ticks, int(RATE_HZ)):

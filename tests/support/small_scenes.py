@@ -71,26 +71,11 @@ def write_small_scene(
         write_mask(root / f"masks/{t.name}.png", np.abs(x - 20) < 8)
     sensor = {"model": "integrate-and-fire/1", "rows_bottom_up": True}
     ids = [c.id for c in cameras]
-    finish_scene(
-        root,
-        SceneDescription(
-            id=f"pattern-{seed}",
-            title="A drifting pattern",
-            licence="CC0-1.0",
-            cameras=cameras,
-            train=tuple(ids[:3]),
-            test=(ids[3],),
-            rate_hz=20000.0,
-            n_ticks=TICKS,
-            radiance_gain=GAIN,
-            targets=targets,
-            sensor=sensor,
-            source={"kind": "test"},
-            points=rng.normal(size=(30, 3)),
-            splits=standard_splits(cameras, "cam_03") if splits else {},
-            extras=extras or {},
-        ),
-    )
+    about = {"id": f"pattern-{seed}", "title": "A drifting pattern", "licence": "CC0-1.0", "source": {"kind": "test"}}
+    clock = {"rate_hz": 20000.0, "n_ticks": TICKS, "radiance_gain": GAIN, "sensor": sensor}
+    array = {"cameras": cameras, "train": tuple(ids[:3]), "test": (ids[3],), "targets": targets}
+    array |= {"points": rng.normal(size=(30, 3)), "splits": standard_splits(cameras, "cam_03") if splits else {}}
+    finish_scene(root, SceneDescription(**about, **clock, **array, extras=extras or {}))
     return root
 
 

@@ -11,18 +11,9 @@ from resumed import check_resumed
 from slow_images import stream_of
 from small_scenes import GAIN, HEIGHT, WIDTH, add_gap, write_small_scene
 
-from spike4dgs.baselines.images.spk2img import maker
+from spike4dgs.baselines.images.spk2img import maker, train
 from spike4dgs.baselines.images.spk2img.maker import WEIGHTS, Card, load_network
 from spike4dgs.baselines.images.spk2img.network import Reconstruction, Spk2ImgNet
-from spike4dgs.baselines.images.spk2img.train import (
-    Example,
-    Training,
-    TrainingSettings,
-    draw,
-    loss_of,
-    open_for_training,
-    read_examples,
-)
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.calibration import Calibration
@@ -41,18 +32,18 @@ def test_windows_beyond_the_clip_are_mirrored(n: int) -> None:
         np.testing.assert_array_equal(window(stream_of(spikes), tick), longer[tick : tick + 41])
 
 
-def dawn(height: int = 20, width: int = 31) -> Example:
+def dawn(height: int = 20, width: int = 31) -> train.Example:
     """An image that is dark until tick 50; then some pixels fire at every tick. The truth is that pattern."""
     lit = np.random.default_rng(5).random((height, width)) < 0.4
     spikes = np.zeros((100, height, width), np.uint8)
     spikes[50:] = lit
     moving = np.array([0, height * width - 1, 7 * width + 11])
-    return Example(stream_of(spikes), 50, lit.astype(np.float32), moving, GAIN)
+    return train.Example(stream_of(spikes), 50, lit.astype(np.float32), moving, GAIN)
 
 
 def test_augmented_patches_fit_their_truth_in_space_and_time() -> None:
     """Turned, flipped, reversed or not: pixels change at the start of the middle tick, where the truth says so."""
-    batch = draw([dawn()], 64, 16, 0.5, np.random.default_rng(0))
+    batch = train.draw([dawn()], 64, 16, 0.5, np.random.default_rng(0))
     assert batch.spikes.shape == (64, 41, 16, 16) and batch.spikes.dtype == batch.rate.dtype == np.float32
     forward = 0
     for spikes, rate in zip(batch.spikes, batch.rate, strict=True):
@@ -71,15 +62,15 @@ def test_patches_around_motion_hold_a_moving_pixel() -> None:
     """A truth that is 1 at the only moving pixel: every patch drawn on motion contains it."""
     rate = np.zeros((20, 31), np.float32)
     rate[3, 30] = 1
-    example = Example(stream_of(np.zeros((100, 20, 31), np.uint8)), 50, rate, np.array([3 * 31 + 30]), GAIN)
-    batch = draw([example], 40, 10, 1.0, np.random.default_rng(1))
+    example = train.Example(stream_of(np.zeros((100, 20, 31), np.uint8)), 50, rate, np.array([3 * 31 + 30]), GAIN)
+    batch = train.draw([example], 40, 10, 1.0, np.random.default_rng(1))
     np.testing.assert_array_equal(batch.rate.sum(axis=(1, 2)), 1)
-    anywhere = draw([example], 40, 10, 0.0, np.random.default_rng(1))
+    anywhere = train.draw([example], 40, 10, 0.0, np.random.default_rng(1))
     assert anywhere.rate.sum() < 30
 
 
 def test_examples_are_all_images_of_a_scene(small_scene: Path) -> None:
-    examples = read_examples(open_for_training(small_scene))
+    examples = train.read_examples(train.open_for_training(small_scene))
     assert [e.tick for e in examples] == [20, 40, 60]
     scene = open_scene(small_scene)
     for example, target in zip(examples, scene.targets, strict=True):
@@ -97,9 +88,9 @@ def test_the_public_benchmark_and_seasons_are_refused(small_scene: Path) -> None
         write_manifest(small_scene)
         if refused:
             with pytest.raises(UserError, match=f"expected a training variant{refused}"):
-                open_for_training(small_scene)
+                train.open_for_training(small_scene)
         else:
-            assert open_for_training(small_scene).id == "pattern-0"
+            assert train.open_for_training(small_scene).id == "pattern-0"
 
 
 @pytest.mark.parametrize(
@@ -116,7 +107,7 @@ def test_images_whose_spikes_lack_ticks_are_not_trained_on(
     small_scene: Path, camera: str, first_tick: int, ticks: int, kept: list[int]
 ) -> None:
     add_gap(small_scene, camera, first_tick, ticks)
-    assert [e.tick for e in read_examples(open_for_training(small_scene, allow_gaps=True))] == kept
+    assert [e.tick for e in train.read_examples(train.open_for_training(small_scene, allow_gaps=True))] == kept
 
 
 def test_gaps_are_refused_unless_allowed(small_scene: Path, tmp_path: Path) -> None:
@@ -137,24 +128,24 @@ def test_loss_from_its_definition() -> None:
         for branch in range(4):
             expected += 0.02 * 5 * np.abs(estimates[b, 2, branch] - truth[b]).mean() / gain[b] / 2
     found = Reconstruction(torch.from_numpy(rate), torch.from_numpy(estimates))
-    loss = loss_of(found, torch.from_numpy(truth), torch.from_numpy(gain), 0.02)
+    loss = train.loss_of(found, torch.from_numpy(truth), torch.from_numpy(gain), 0.02)
     assert loss.item() == pytest.approx(expected, rel=1e-12)
     perfect = Reconstruction(torch.from_numpy(truth), torch.from_numpy(truth)[:, None, None].expand(2, 5, 4, 6, 6))
-    assert loss_of(perfect, torch.from_numpy(truth), torch.from_numpy(gain), 0.02).item() == 0
+    assert train.loss_of(perfect, torch.from_numpy(truth), torch.from_numpy(gain), 0.02).item() == 0
 
 
-SMALL = TrainingSettings(width=4, steps=25, batch=2, patch=16, warm_up=5, lr=5e-3)
+SMALL = train.TrainingSettings(width=4, steps=25, batch=2, patch=16, warm_up=5, lr=5e-3)
 
 
 def test_training_learns(small_scene: Path) -> None:
-    training = Training(read_examples(open_for_training(small_scene)), SMALL, "cpu", seed=1)
+    training = train.Training(train.read_examples(train.open_for_training(small_scene)), SMALL, "cpu", seed=1)
     losses = [training.train_step() for _ in range(SMALL.steps)]
     assert np.mean(losses[-8:]) < 0.6 * np.mean(losses[:4])
 
 
 def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(small_scene: Path, tmp_path: Path) -> None:
-    examples = read_examples(open_for_training(small_scene))
-    check_resumed(lambda: Training(examples, SMALL, "cpu", seed=2), tmp_path / "c.safetensors")
+    examples = train.read_examples(train.open_for_training(small_scene))
+    check_resumed(lambda: train.Training(examples, SMALL, "cpu", seed=2), tmp_path / "c.safetensors")
 
 
 def test_command_to_weights_to_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -11,13 +11,7 @@ from resumed import same_tensors
 from toy_fits import silent
 from toy_world import GAIN, ToyWorld
 
-from spike4dgs.baselines.radiance_field.fit import (
-    PUBLISHED,
-    RADIANCE_FIELD,
-    Fitter,
-    RadianceFieldSettings,
-    fit_radiance_field,
-)
+from spike4dgs.baselines.radiance_field import fit
 from spike4dgs.baselines.radiance_field.march import camera_rays
 from spike4dgs.baselines.radiance_field.model import RadianceModel
 from spike4dgs.baselines.radiance_field.occupancy import OccupancySettings
@@ -32,7 +26,7 @@ from spike4dgs.method.training_views.training_images import TrainingImages
 WORLD = ToyWorld(width=40, height=25, n_ticks=80)
 _SIZES = {"coarse_samples": 24, "fine_samples": 8, "depth": 3, "width": 32, "coarse_depth": 2, "coarse_width": 16}
 _RATES = {"position_frequencies": 5, "direction_frequencies": 1, "lr_field": 1e-2, "lr_field_last": 1e-3}
-SMALL = RadianceFieldSettings(steps=220, rays=128, **_SIZES, **_RATES)
+SMALL = fit.RadianceFieldSettings(steps=220, rays=128, **_SIZES, **_RATES)
 
 
 def plane(camera, t: float = 0.5, travel: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -56,14 +50,14 @@ def job(
     images = TrainingImages(Views.from_cameras(scene.cameras), ticks, torch.from_numpy(frames), 80)
     extent = measure(start, scene)
     grid = OccupancySettings(cells=16, every=every)
-    settings = {**RADIANCE_FIELD.settings, "motion": motion, "occupancy": grid}
+    settings = {**fit.RADIANCE_FIELD.settings, "motion": motion, "occupancy": grid}
     request = FitRequest(seed=seed, progress=progress, checkpoint=checkpoint)
     return FitJob(scene, start, images, extent, settings, request, "this")
 
 
 @cache
 def fitted(travel: float) -> RadianceModel:
-    return fit_radiance_field(job(travel=travel))
+    return fit.fit_radiance_field(job(travel=travel))
 
 
 def psnr(model: RadianceModel, travel: float, at: float | None = None) -> float:
@@ -126,13 +120,13 @@ def short(progress: Progress = silent, checkpoint: Path | None = None, seed: int
     return job(SHORT, progress, checkpoint, seed, travel, every=3)
 
 
-def tensors(fitter: Fitter) -> dict[str, torch.Tensor]:
+def tensors(fitter: fit.Fitter) -> dict[str, torch.Tensor]:
     return {k: v.detach().clone() for k, v in fitter.state().tensors.items()}
 
 
 @cache
 def uninterrupted() -> dict[str, torch.Tensor]:
-    fitter = Fitter(short())
+    fitter = fit.Fitter(short())
     fitter.run()
     return tensors(fitter)
 
@@ -149,23 +143,23 @@ def test_killed_and_resumed_gives_the_same_bits(step: int, tmp_path: Path) -> No
 
     path = tmp_path / "fit.safetensors"
     with pytest.raises(Killed):
-        Fitter(short(dies, path)).run(checkpoint_s=0)
-    second = Fitter(short(silent, path))
+        fit.Fitter(short(dies, path)).run(checkpoint_s=0)
+    second = fit.Fitter(short(silent, path))
     second.run()
     same_tensors(tensors(second), uninterrupted())
 
 
 def test_another_seed_gives_another_field_and_another_fits_checkpoint_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fit.safetensors"
-    other = Fitter(short(silent, path, seed=1))
+    other = fit.Fitter(short(silent, path, seed=1))
     other.run()
     assert not torch.equal(tensors(other)["field.fine.value.weight"], uninterrupted()["field.fine.value.weight"])
     with pytest.raises(UserError, match="another fit's; delete it"):
-        Fitter(replace(short(silent, path, travel=0.0), key="that")).run()
+        fit.Fitter(replace(short(silent, path, travel=0.0), key="that")).run()
 
 
 def test_every_parameter_learns() -> None:
-    fitter = Fitter(short())
+    fitter = fit.Fitter(short())
     before = {k: v.detach().clone() for k, v in fitter.field.named_parameters()}
     for _ in range(3):
         fitter.train_step()
@@ -174,7 +168,7 @@ def test_every_parameter_learns() -> None:
 
 
 def test_times_open_up_from_the_middle() -> None:
-    fitter = Fitter(job(replace(SHORT, steps=1000)))
+    fitter = fit.Fitter(job(replace(SHORT, steps=1000)))
     seen: list[set[int]] = []
     for first in (0, 500):
         seen.append(set())
@@ -185,14 +179,14 @@ def test_times_open_up_from_the_middle() -> None:
 
 
 def test_budgets_scale_the_steps_and_published_values_are_settings() -> None:
-    s = RADIANCE_FIELD.settings
-    motion = RadianceFieldSettings()
+    s = fit.RADIANCE_FIELD.settings
+    motion = fit.RadianceFieldSettings()
     assert scaled(s, 0.5) == {**s, "motion": replace(motion, steps=round(motion.steps / 2))}
-    paper = override(s, PUBLISHED, "paper")
-    assert isinstance(found := paper["motion"], RadianceFieldSettings)
+    paper = override(s, fit.PUBLISHED, "paper")
+    assert isinstance(found := paper["motion"], fit.RadianceFieldSettings)
     assert found.steps == 200_000 and found.width == 256 and found.lr_field == 5e-4
 
 
 def test_spikes_of_the_stream_are_what_a_rate_is_compared_with() -> None:
-    fitter = Fitter(job())
+    fitter = fit.Fitter(job())
     assert torch.allclose(fitter.recorded[0].view(8, 25, 40), GAIN * job().training_images.images[0])

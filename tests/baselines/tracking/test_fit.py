@@ -11,16 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from toy_fits import silent
 from toy_world import ToyWorld
 
-from spike4dgs.baselines.tracking.fit import (
-    PUBLISHED,
-    TRACKING,
-    Tracker,
-    TrackingSettings,
-    Visit,
-    first_index,
-    fit_tracking,
-    visits,
-)
+from spike4dgs.baselines.tracking import fit
 from spike4dgs.baselines.tracking.losses import find_neighbours
 from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
 from spike4dgs.benchmark.errors import UserError
@@ -63,19 +54,19 @@ def job(
     if static:
         images = replace(images, images=images.images[2:3].expand(TIMES, -1, -1, -1).contiguous())
     scene = TrainingScene("toy", "toy", CAMERAS, (), 20000.0, WORLD.n_ticks, 0.6)
-    motion, supervision = replace(TrackingSettings(), **changes), PixelSettings(ssim_weight)
-    settings = {**TRACKING.settings, "motion": motion, "supervision": supervision}
+    motion, supervision = replace(fit.TrackingSettings(), **changes), PixelSettings(ssim_weight)
+    settings = {**fit.TRACKING.settings, "motion": motion, "supervision": supervision}
     request = FitRequest(progress=progress, checkpoint=checkpoint)
     return FitJob(scene, start, images, measure(start, scene), settings, request, "this")
 
 
 def test_times_are_visited_outward_with_the_velocity_known_so_far() -> None:
-    assert visits(2, 5) == [Visit(3, 2, None), Visit(4, 3, 2), Visit(1, 2, 3), Visit(0, 1, 2)]
-    assert visits(0, 3) == [Visit(1, 0, None), Visit(2, 1, 0)]
-    assert visits(2, 3) == [Visit(1, 2, None), Visit(0, 1, 2)]
-    assert visits(0, 1) == []
+    assert fit.visits(2, 5) == [fit.Visit(3, 2, None), fit.Visit(4, 3, 2), fit.Visit(1, 2, 3), fit.Visit(0, 1, 2)]
+    assert fit.visits(0, 3) == [fit.Visit(1, 0, None), fit.Visit(2, 1, 0)]
+    assert fit.visits(2, 3) == [fit.Visit(1, 2, None), fit.Visit(0, 1, 2)]
+    assert fit.visits(0, 1) == []
     known = {7}
-    for v in visits(7, 20):
+    for v in fit.visits(7, 20):
         assert {v.before, *([] if v.earlier is None else [v.earlier])} <= known
         known.add(v.index)
     assert known == set(range(20))
@@ -83,7 +74,7 @@ def test_times_are_visited_outward_with_the_velocity_known_so_far() -> None:
 
 @pytest.mark.parametrize(("start", "index"), [(0.0, 0), (0.5, 2), (1.0, 4), (-3.0, 0), (9.0, 4)])
 def test_the_first_time_is_where_the_settings_say(start: float, index: int) -> None:
-    assert first_index(job(start=start)) == index
+    assert fit.first_index(job(start=start)) == index
 
 
 @pytest.mark.parametrize(("lacking", "index"), [({2: 8}, 1), ({2: 3, 1: 4}, 3), ({i: 8 for i in range(TIMES)}, 2)])
@@ -92,12 +83,12 @@ def test_the_first_time_is_one_that_most_views_have_measured(lacking: dict[int, 
     missing = torch.zeros(TIMES, len(CAMERAS), dtype=torch.bool)
     for time, views in lacking.items():
         missing[time, :views] = True
-    assert first_index(replace(j, training_images=replace(j.training_images, missing=missing))) == index
+    assert fit.first_index(replace(j, training_images=replace(j.training_images, missing=missing))) == index
 
 
 @cache
 def tracked() -> TrackedModel:
-    return fit_tracking(job(first_steps=150, lr_means=3e-3, lr_means_last=1e-4, lr_colors=2.5e-4))
+    return fit.fit_tracking(job(first_steps=150, lr_means=3e-3, lr_means_last=1e-4, lr_colors=2.5e-4))
 
 
 def test_known_translation_is_recovered() -> None:
@@ -128,15 +119,15 @@ def test_the_background_is_fixed_or_hardly_moves() -> None:
     assert torch.equal(start.means[others], stop.means[others])
     assert torch.equal(start.quats[others], stop.quats[others])
     assert not torch.equal(start.means, stop.means)
-    soft = fit_tracking(job(**TINY, freeze_background=False))
-    moving = int(fit_tracking(job(**TINY)).tracks.free.numel())
+    soft = fit.fit_tracking(job(**TINY, freeze_background=False))
+    moving = int(fit.fit_tracking(job(**TINY)).tracks.free.numel())
     assert len(soft.tracks.free) == len(soft.tracks.rows) > moving
     assert (soft.tracks.means[0, moving:] != soft.tracks.means[2, moving:]).any()
 
 
-def tracker_of(j: FitJob) -> Tracker:
+def tracker_of(j: FitJob) -> fit.Tracker:
     g = from_points(j.start.points, j.start.values, opacity=0.5)
-    tracker = Tracker(j, g, foreground_masks(j.training_images.images))
+    tracker = fit.Tracker(j, g, foreground_masks(j.training_images.images))
     tracker.graph = find_neighbours(tracker.local.means[: tracker.count], 4)
     return tracker
 
@@ -159,7 +150,7 @@ def test_what_flies_off_to_where_nothing_moves_stays_where_it_was() -> None:
     tracker = tracker_of(job(**TINY))
     tracks = tracker.tracks
     tracks.means[1, 7] -= torch.tensor([0.0, 0.0, 0.45])  # from there its velocity takes it far above the board
-    tracker.track(Visit(3, 2, 1))
+    tracker.track(fit.Visit(3, 2, 1))
     assert torch.equal(tracks.means[3, 7], tracks.means[2, 7])
     assert (tracks.means[3, 8:] != tracks.means[2, 8:]).any(dim=1).float().mean() > 0.9
 
@@ -170,7 +161,7 @@ class Killed(Exception):
 
 @cache
 def uninterrupted() -> TrackedModel:
-    return fit_tracking(job(**TINY))
+    return fit.fit_tracking(job(**TINY))
 
 
 def everything(model: TrackedModel) -> dict[str, torch.Tensor]:
@@ -186,21 +177,21 @@ def test_killed_at_any_time_and_resumed_gives_the_same_bits(time: str, tmp_path:
             raise Killed
 
     with pytest.raises(Killed):
-        fit_tracking(job(path, dies, **TINY), checkpoint_s=0)
+        fit.fit_tracking(job(path, dies, **TINY), checkpoint_s=0)
     assert path.is_file() == (time != "loss")  # before the end of the first time there is nothing to go on from
     seen: list[str] = []
-    resumed = fit_tracking(job(path, lambda done, total, note="": seen.append(note), **TINY))
+    resumed = fit.fit_tracking(job(path, lambda done, total, note="": seen.append(note), **TINY))
     assert any(note.startswith("loss") for note in seen) == (time == "loss")
     same_tensors(everything(resumed), everything(uninterrupted()))
 
 
 def test_finished_fit_is_read_back_and_another_fit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fit.safetensors"
-    one, two = (fit_tracking(job(path, **TINY)) for _ in range(2))
+    one, two = (fit.fit_tracking(job(path, **TINY)) for _ in range(2))
     images = [m.render(WORLD.held_out, 3000.0) for m in (one, two)]
     assert images[0].dtype == np.float32 and images[0].shape == (40, 64) and np.array_equal(*images)
     with pytest.raises(UserError, match="another fit's; delete it"):
-        fit_tracking(replace(job(path, **TINY), key="that"))
+        fit.fit_tracking(replace(job(path, **TINY), key="that"))
 
 
 def test_the_model_knows_the_cameras_that_the_fit_had() -> None:
@@ -210,13 +201,13 @@ def test_the_model_knows_the_cameras_that_the_fit_had() -> None:
 
 def test_progress_counts_all_steps_to_the_end() -> None:
     seen: list[tuple[int, int]] = []
-    fit_tracking(job(progress=lambda done, total, note="": seen.append((done, total)), **TINY))
+    fit.fit_tracking(job(progress=lambda done, total, note="": seen.append((done, total)), **TINY))
     assert {total for _, total in seen} == {3 + 4 * 2}
     assert [done for done, _ in seen] == sorted(done for done, _ in seen) and seen[-1][0] == 11
 
 
 def test_a_scene_in_which_nothing_moves_is_one_image(tmp_path: Path) -> None:
-    model = fit_tracking(job(tmp_path / "fit.safetensors", static=True, **TINY))
+    model = fit.fit_tracking(job(tmp_path / "fit.safetensors", static=True, **TINY))
     images = [model.render(WORLD.held_out, t) for t in (0.0, 6000.0, 12000.0)]
     assert len(model.tracks.free) == 0 and np.array_equal(images[0], images[1]) and np.array_equal(images[1], images[2])
 
@@ -226,7 +217,7 @@ def test_a_fit_in_mean_light_renders_the_light_of_its_instant(static: bool) -> N
     """Of the background too, which nothing tracks."""
     j = job(**TINY, static=static)
     light = Light(1 + 0.3 * np.sin(2 * np.pi * np.arange(WORLD.n_ticks) / WORLD.n_ticks))
-    mean, lit = fit_tracking(j), fit_tracking(replace(j, light=light))
+    mean, lit = fit.fit_tracking(j), fit.fit_tracking(replace(j, light=light))
     for t_us in mean.tracks.times_us.tolist():
         image = mean.render(WORLD.held_out, t_us) * factor_at(light.factors, t_us / mean.duration_us)
         np.testing.assert_allclose(lit.render(WORLD.held_out, t_us), image, atol=1e-5)
@@ -278,9 +269,9 @@ def test_model_moves_only_its_own_gaussians_and_holds_the_clips_ends() -> None:
 
 
 def test_budget_scales_steps_only_and_the_publications_counts_are_settings() -> None:
-    s = TrackingSettings()
+    s = fit.TrackingSettings()
     half = s.scaled(0.5)
     assert (half.first_steps, half.later_steps) == (s.first_steps // 2, s.later_steps // 2)
     assert replace(half, first_steps=s.first_steps, later_steps=s.later_steps) == s
-    paper = override(TRACKING.settings, PUBLISHED, "paper")
-    assert TRACKING.published == PUBLISHED and paper["motion"] == replace(s, first_steps=2500, later_steps=500)
+    paper = override(fit.TRACKING.settings, fit.PUBLISHED, "paper")
+    assert fit.TRACKING.published == fit.PUBLISHED and paper["motion"] == replace(s, first_steps=2500, later_steps=500)

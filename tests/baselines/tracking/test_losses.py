@@ -9,17 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from spike4dgs.baselines.tracking.losses import (
-    SHARPNESS,
-    background_term,
-    color_term,
-    conjugate,
-    find_neighbours,
-    multiply,
-    physical_loss,
-    physical_terms,
-    remember,
-)
+from spike4dgs.baselines.tracking import losses
 from spike4dgs.benchmark.errors import UserError
 
 
@@ -64,31 +54,31 @@ def by_loop(
 
 def test_neighbours_are_the_nearest_and_the_median_pair_weighs_one_over_e() -> None:
     points, _ = cloud(51, size=30.0)
-    graph = find_neighbours(points, 7)
+    graph = losses.find_neighbours(points, 7)
     distance = cdist(points, points) + np.diag(np.full(51, np.inf))
     for i in range(51):
         assert set(graph.index[i].tolist()) == set(np.argsort(distance[i])[:7])
         np.testing.assert_allclose(graph.rest[i] * graph.unit, np.sort(distance[i])[:7], rtol=1e-12)
     assert math.isclose(float((graph.root**2).median()), math.exp(-1), rel_tol=1e-9)
-    torch.testing.assert_close(graph.root**2, torch.exp(-SHARPNESS * graph.rest**2))
+    torch.testing.assert_close(graph.root**2, torch.exp(-losses.SHARPNESS * graph.rest**2))
 
 
 def test_size_of_the_world_changes_no_term() -> None:
     (x, q), (y, r) = cloud(30), cloud(30, seed=1)
-    small, large = ((find_neighbours(x * s, 5), x * s, (x + 0.01 * y) * s) for s in (1.0, 250.0))
-    terms = [physical_terms(g, remember(g, a, q), b, r) for g, a, b in (small, large)]
+    small, large = ((losses.find_neighbours(x * s, 5), x * s, (x + 0.01 * y) * s) for s in (1.0, 250.0))
+    terms = [losses.physical_terms(g, losses.remember(g, a, q), b, r) for g, a, b in (small, large)]
     torch.testing.assert_close(torch.stack(terms[0]), torch.stack(terms[1]))
 
 
 def test_fewer_points_than_neighbours_take_all_others() -> None:
-    graph = find_neighbours(cloud(4)[0], 20)
+    graph = losses.find_neighbours(cloud(4)[0], 20)
     assert graph.index.shape == (4, 3)
 
 
 @pytest.mark.parametrize("points", [torch.zeros(1, 3), torch.zeros(5, 3)])
 def test_nothing_to_relate_is_refused(points: torch.Tensor) -> None:
     with pytest.raises(UserError, match="tracking"):
-        find_neighbours(points, 3)
+        losses.find_neighbours(points, 3)
 
 
 @given(st.integers(0, 10**6), st.floats(0, math.pi), st.floats(-50, 50))
@@ -99,28 +89,28 @@ def test_a_rigid_motion_costs_nothing(seed: int, angle: float, far: float) -> No
     turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
     w = turn.as_quat()[[3, 0, 1, 2]]
     moved = x @ torch.from_numpy(turn.as_matrix()).T + far
-    turned = multiply(torch.from_numpy(w).expand_as(q), q)
-    graph = find_neighbours(x, 6)
-    for term in physical_terms(graph, remember(graph, x, q), moved, turned):
+    turned = losses.multiply(torch.from_numpy(w).expand_as(q), q)
+    graph = losses.find_neighbours(x, 6)
+    for term in losses.physical_terms(graph, losses.remember(graph, x, q), moved, turned):
         assert abs(float(term)) < 1e-10
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_terms_are_those_of_a_loop_over_the_pairs(seed: int) -> None:
     (first, _), (x, q), (y, r) = (cloud(20, 10 * seed + i) for i in range(3))
-    graph = find_neighbours(first, 5)
-    terms = physical_terms(graph, remember(graph, x, q), y, r)
+    graph = losses.find_neighbours(first, 5)
+    terms = losses.physical_terms(graph, losses.remember(graph, x, q), y, r)
     expected = by_loop(first.numpy(), 5, (x.numpy(), q.numpy()), (y.numpy(), r.numpy()))
     np.testing.assert_allclose([float(t) for t in terms], expected, rtol=1e-9)
 
 
 def test_gradients_are_those_of_finite_differences() -> None:
     (first, _), (x, q), (y, r) = (cloud(8, i) for i in range(3))
-    graph = find_neighbours(first, 3)
-    before = remember(graph, x, q)
+    graph = losses.find_neighbours(first, 3)
+    before = losses.remember(graph, x, q)
 
     def terms(means: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
-        return torch.stack(physical_terms(graph, before, means, quats))
+        return torch.stack(losses.physical_terms(graph, before, means, quats))
 
     assert torch.autograd.gradcheck(terms, (y.requires_grad_(), r.requires_grad_()))
 
@@ -137,7 +127,7 @@ def test_fused_kernel_is_the_float64_twin(hard_case: HardCase, case: str, weight
     x = x.float().double() + (1e3 if case == "far" else 0.0)
     if case == "coincident":
         x[1::2] = x[::2]
-    graph = find_neighbours(x, 9)
+    graph = losses.find_neighbours(x, 9)
     y = x if case == "unmoved" else x + 0.05 * cloud(60, 4)[0]
     r = q if case == "unmoved" else q + 0.05 * cloud(60, 5)[1]
     y, r = y.float().double(), r.float().double()
@@ -145,7 +135,7 @@ def test_fused_kernel_is_the_float64_twin(hard_case: HardCase, case: str, weight
     for dtype in (torch.float64, torch.float32):
         leaves = [t.to(dtype).clone().requires_grad_() for t in (y, r)]
         g = type(graph)(graph.index, graph.root.to(dtype), graph.rest.to(dtype), graph.unit)
-        value = 3 * physical_loss(g, remember(g, x.to(dtype), q.to(dtype)), *leaves, weights)
+        value = 3 * losses.physical_loss(g, losses.remember(g, x.to(dtype), q.to(dtype)), *leaves, weights)
         value.backward()
         results.append((value.detach().double(), *(leaf.grad.double() for leaf in leaves)))
     slow, fast = results
@@ -159,17 +149,18 @@ def test_fused_kernel_is_the_float64_twin(hard_case: HardCase, case: str, weight
 def test_quaternion_product_turns_like_the_second_then_the_first() -> None:
     (_, a), (_, b) = cloud(9), cloud(9, 1)
     expected = (scipy_rotation(a) * scipy_rotation(b)).as_matrix()
-    np.testing.assert_allclose(scipy_rotation(multiply(a, b)).as_matrix(), expected, atol=1e-12)
+    np.testing.assert_allclose(scipy_rotation(losses.multiply(a, b)).as_matrix(), expected, atol=1e-12)
     unit = a / a.norm(dim=-1, keepdim=True)
     identity = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand_as(unit)
-    torch.testing.assert_close(multiply(unit, conjugate(unit)), identity)
+    torch.testing.assert_close(losses.multiply(unit, losses.conjugate(unit)), identity)
 
 
 def test_background_and_colour_terms_are_mean_absolute_sums() -> None:
     (x, q), (y, r) = cloud(6), cloud(6, 1)
     a, b = q.numpy() / np.linalg.norm(q, axis=1)[:, None], r.numpy() / np.linalg.norm(r, axis=1)[:, None]
     expected = sum(np.abs(y[i] - x[i]).sum().item() / 0.3 + np.abs(b[i] - a[i]).sum() for i in range(6)) / 6
-    assert math.isclose(float(background_term(y, r, x, q, 0.3)), expected, rel_tol=1e-12)
-    assert float(background_term(y[:0], r[:0], x[:0], q[:0], 0.3)) == 0
+    assert math.isclose(float(losses.background_term(y, r, x, q, 0.3)), expected, rel_tol=1e-12)
+    assert float(losses.background_term(y[:0], r[:0], x[:0], q[:0], 0.3)) == 0
     c, d = torch.rand(5, 1), torch.rand(5, 1)
-    assert math.isclose(float(color_term(c, d)), sum(abs(float(c[i] - d[i])) for i in range(5)) / 5, rel_tol=1e-6)
+    expected = sum(abs(float(c[i] - d[i])) for i in range(5)) / 5
+    assert math.isclose(float(losses.color_term(c, d)), expected, rel_tol=1e-6)

@@ -7,18 +7,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
+from spike4dgs.method.gaussians import optimizer
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
-from spike4dgs.method.gaussians.optimizer import (
-    MOMENTS,
-    Adam,
-    Averages,
-    Decay,
-    WarmCosine,
-    apply_edit,
-    export_state,
-    set_learning_rate,
-    set_learning_rates,
-)
 from spike4dgs.method.gaussians.parameters import Edit, Gaussians, densify, prune, relocate
 from spike4dgs.method.splat import Views, render
 
@@ -52,11 +42,11 @@ def mask(n: int, *rows: int) -> Tensor:
     return torch.zeros(n, dtype=torch.bool).index_fill(0, torch.tensor(rows), True)
 
 
-def trained(gaussians: Gaussians) -> tuple[Gaussians, torch.nn.Parameter, Adam]:
+def trained(gaussians: Gaussians) -> tuple[Gaussians, torch.nn.Parameter, optimizer.Adam]:
     """Gaussians, something else beside them, and an optimiser whose moments differ in every row."""
     leaves, other = gaussians.trainable(), torch.nn.Parameter(torch.ones(3))
-    adam = Adam({**{k: [v] for k, v in leaves.tensors().items()}, "grid": [other]}, (0.9, 0.99))
-    set_learning_rates(adam, {g.name: Decay(1e-3, 1e-3) for g in adam.groups}, 0.0)
+    adam = optimizer.Adam({**{k: [v] for k, v in leaves.tensors().items()}, "grid": [other]}, (0.9, 0.99))
+    optimizer.set_learning_rates(adam, {g.name: optimizer.Decay(1e-3, 1e-3) for g in adam.groups}, 0.0)
     rng = torch.Generator().manual_seed(5)
     for _ in range(3):
         for p in [*leaves.tensors().values(), other]:
@@ -76,16 +66,16 @@ EDITS = {
 @pytest.mark.parametrize("name", EDITS)
 def test_every_rows_moments_are_those_of_the_row_that_it_continues(name: str) -> None:
     leaves, other, adam = trained(cloud(12))
-    old, before = {k: v.clone() for k, v in export_state(adam).items()}, other.detach().clone()
+    old, before = {k: v.clone() for k, v in optimizer.export_state(adam).items()}, other.detach().clone()
     edit: Edit = EDITS[name](leaves)
-    after = apply_edit(adam, edit)
-    new = export_state(adam)
+    after = optimizer.apply_edit(adam, edit)
+    new = optimizer.export_state(adam)
     assert new.keys() == old.keys()
     kept = edit.source >= 0
     assert kept.any()
     for key, value in old.items():
         group, _, what = key.split(".")
-        if group == "grid" or what not in MOMENTS:  # another group, and the count of steps
+        if group == "grid" or what not in optimizer.MOMENTS:  # another group, and the count of steps
             assert torch.equal(new[key], value)
             continue
         assert new[key].shape == after.tensors()[group].shape
@@ -207,24 +197,24 @@ def test_gradient_statistics_are_those_of_each_view_alone_in_half_images() -> No
 
 
 def test_a_warm_cosine_rises_linearly_and_falls_to_nothing() -> None:
-    schedule = WarmCosine(peak=3e-3, warm_up=8, steps=50)
+    schedule = optimizer.WarmCosine(peak=3e-3, warm_up=8, steps=50)
     for step in range(50):
         rise = (step + 1) / 8 if step < 8 else 1.0
         assert schedule.at(step) == pytest.approx(3e-3 * rise * math.cos(math.pi * step / 100) ** 2, rel=1e-9)
     assert schedule.at(50) == pytest.approx(0, abs=1e-12)
-    assert WarmCosine(peak=1.0, warm_up=1, steps=9).at(0) == 1
+    assert optimizer.WarmCosine(peak=1.0, warm_up=1, steps=9).at(0) == 1
 
 
 def test_one_rate_is_set_for_all_groups() -> None:
-    adam = Adam({name: [torch.zeros(1, requires_grad=True)] for name in ("a", "b")}, (0.9, 0.999))
-    set_learning_rate(adam, 0.25)
+    adam = optimizer.Adam({name: [torch.zeros(1, requires_grad=True)] for name in ("a", "b")}, (0.9, 0.999))
+    optimizer.set_learning_rate(adam, 0.25)
     assert [group.lr for group in adam.groups] == [0.25, 0.25]
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_averages_are_plain_means_of_all_parameters(count: int) -> None:
     a, b = torch.zeros(5, 3, requires_grad=True), torch.zeros(2, requires_grad=True)
-    adam, averages, seen = Adam({"a": [a], "b": [b]}, (0.9, 0.99)), Averages(), []
+    adam, averages, seen = optimizer.Adam({"a": [a], "b": [b]}, (0.9, 0.99)), optimizer.Averages(), []
     for n in range(1, count + 1):
         with torch.no_grad():
             a.copy_(torch.randn(a.shape, generator=torch.Generator().manual_seed(n)))

@@ -8,22 +8,12 @@ from hypothesis import strategies as st
 from torch.nn import functional
 
 from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.motion import hexplane
 from spike4dgs.method.motion.base import Extent
-from spike4dgs.method.motion.hexplane import (
-    HexPlane,
-    HexPlaneMotion,
-    HexPlaneSettings,
-    HexPlaneShape,
-    hexplane_shape,
-    plane_tv,
-    sample_level,
-    time_smoothness,
-    time_sparsity,
-)
 from spike4dgs.method.motion.hexplane_cpu import sample_levels
 from spike4dgs.method.motion.table import MOTIONS
 
-SHAPE = HexPlaneShape(spatial=(5, 9), times=7, features=6, width=16)
+SHAPE = hexplane.HexPlaneShape(spatial=(5, 9), times=7, features=6, width=16)
 
 
 def rng(seed: int = 0) -> torch.Generator:
@@ -34,9 +24,9 @@ def gaussians(n: int = 50) -> Gaussians:
     return replace(cloud(n), extra={})
 
 
-def motion() -> HexPlaneMotion:
+def motion() -> hexplane.HexPlaneMotion:
     box = Extent(-torch.ones(3), torch.ones(3), 2.0, n_ticks=96, width=27)
-    return HexPlaneMotion(box, HexPlaneSettings(features=6, mlp_width=16), rng())
+    return hexplane.HexPlaneMotion(box, hexplane.HexPlaneSettings(features=6, mlp_width=16), rng())
 
 
 @pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
@@ -74,7 +64,7 @@ def test_means_move_in_units_of_the_scene():
 
 
 def test_time_uses_the_whole_axis():
-    planes = HexPlane(SHAPE, torch.zeros(3), torch.ones(3), rng())
+    planes = hexplane.HexPlane(SHAPE, torch.zeros(3), torch.ones(3), rng())
     with torch.no_grad():
         for p in planes.time:
             p[:] = torch.arange(1.0, 8.0)[None, :, None, None]
@@ -85,7 +75,7 @@ def test_time_uses_the_whole_axis():
 
 
 def test_points_outside_the_box_take_its_border():
-    planes = HexPlane(SHAPE, -torch.ones(3), torch.ones(3), rng())
+    planes = hexplane.HexPlane(SHAPE, -torch.ones(3), torch.ones(3), rng())
     inside, outside = torch.tensor([[1.0, -1.0, 0.2]]), torch.tensor([[7.0, -3.0, 0.2]])
     assert torch.allclose(planes(inside, 0.5), planes(outside, 0.5))
 
@@ -104,13 +94,13 @@ def test_kernel_equals_the_plain_twin_in_value_and_gradient(seed, size, features
         if fast:
             out = sample_levels(leaves[0], [leaves[2]], [leaves[1]])
         else:
-            out = sample_level(*(x.double() for x in leaves))
+            out = hexplane.sample_level(*(x.double() for x in leaves))
         (out * weight).sum().backward()
         results.append([out.detach().float(), *(x.grad for x in leaves)])
     # Gradients are sums of terms, which may cancel and leave what float32 rounds off: no term is larger than this one.
     largest = [functional.max_pool2d(space.abs().clamp(min=1).movedim(-1, 1), 3, 1, 1).movedim(1, -1)]
     largest += [functional.max_pool1d(lines.abs().clamp(min=1).mT, 3, 1, 1).mT]
-    term = size * float((sample_level(unit, *largest) * weight.abs()).max()) if n else 0.0
+    term = size * float((hexplane.sample_level(unit, *largest) * weight.abs()).max()) if n else 0.0
     for fast, slow in zip(*results, strict=True):
         if slow.numel():
             assert float((fast - slow).abs().max()) <= 2e-5 * float(slow.abs().max()) + 4e-7 * term
@@ -132,7 +122,7 @@ def test_levels_stand_side_by_side_and_do_not_mix(features):
 
 
 def test_start_middle_and_end_of_the_clip_train_different_rows():
-    planes = HexPlane(SHAPE, torch.zeros(3), torch.ones(3), rng())
+    planes = hexplane.HexPlane(SHAPE, torch.zeros(3), torch.ones(3), rng())
     touched = []
     for t in (0.0, 0.5, 1.0):
         planes.zero_grad()
@@ -149,28 +139,29 @@ def test_kernel_survives_points_that_are_no_numbers():
 def test_plane_tv_of_a_ramp_and_of_a_checkerboard():
     i, j = torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="ij")
     ramp = (2 * i + 3 * j)[None, :, :, None].repeat(3, 1, 1, 4)
-    assert plane_tv([ramp]).item() == pytest.approx(3 * (4 + 9))  # a second difference would give 0
+    assert hexplane.plane_tv([ramp]).item() == pytest.approx(3 * (4 + 9))  # a second difference would give 0
     board = ((i + j) % 2)[None, :, :, None].repeat(3, 1, 1, 4)
-    assert plane_tv([board]).item() == pytest.approx(3 * 2)
-    assert plane_tv([ramp, ramp]).item() == plane_tv([ramp]).item()  # the weight does not grow with levels
+    assert hexplane.plane_tv([board]).item() == pytest.approx(3 * 2)
+    one, two = (hexplane.plane_tv(levels).item() for levels in ([ramp], [ramp, ramp]))
+    assert one == two, "the weight does not grow with levels"
 
 
 def test_time_smoothness_ignores_steady_change_and_measures_acceleration():
     t = torch.arange(9.0)[None, :, None, None]
     steady, accelerated = (5 * t).expand(3, 9, 6, 2), (t**2).expand(3, 9, 6, 2)
-    assert time_smoothness([steady]).item() == pytest.approx(0, abs=1e-9)
-    assert time_smoothness([accelerated]).item() == pytest.approx(3 * 4)
+    assert hexplane.time_smoothness([steady]).item() == pytest.approx(0, abs=1e-9)
+    assert hexplane.time_smoothness([accelerated]).item() == pytest.approx(3 * 4)
 
 
 def test_gradients_of_differences_are_those_of_finite_differences():
     planes = [torch.randn(3, r, r, 2, generator=rng(r), dtype=torch.float64, requires_grad=True) for r in (5, 4)]
-    for penalty in (plane_tv, time_smoothness):
+    for penalty in (hexplane.plane_tv, hexplane.time_smoothness):
         assert torch.autograd.gradcheck(lambda *found, f=penalty: f(found), planes)
 
 
 def test_time_sparsity_is_the_distance_from_one():
-    assert time_sparsity([torch.ones(3, 4, 5, 2)]).item() == 0
-    assert time_sparsity([torch.full((3, 4, 5, 2), 0.25)]).item() == pytest.approx(3 * 0.75)
+    assert hexplane.time_sparsity([torch.ones(3, 4, 5, 2)]).item() == 0
+    assert hexplane.time_sparsity([torch.full((3, 4, 5, 2), 0.25)]).item() == pytest.approx(3 * 0.75)
 
 
 def extent(n_ticks: int, width: int) -> Extent:
@@ -178,8 +169,8 @@ def extent(n_ticks: int, width: int) -> Extent:
 
 
 def test_resolution_follows_clip_length_and_image_size():
-    s = HexPlaneSettings()
-    short, long = hexplane_shape(extent(400, 200), s), hexplane_shape(extent(2000, 400), s)
+    s = hexplane.HexPlaneSettings()
+    short, long = hexplane.hexplane_shape(extent(400, 200), s), hexplane.hexplane_shape(extent(2000, 400), s)
     assert long.times == pytest.approx(5 * short.times, rel=0.1)
     assert long.spatial[-1] == pytest.approx(2 * short.spatial[-1], rel=0.1)
     assert len(short.spatial) == s.levels and short.spatial[0] == short.spatial[1] // 2

@@ -58,21 +58,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("recorded") / "toy"
     write_streams(root, stream_name("{}"))
     cameras = WORLD.training.cameras
-    description = SceneDescription(
-        id="toy",
-        title="A toy world",
-        licence="CC0-1.0",
-        cameras=cameras,
-        train=tuple(c.id for c in cameras),
-        test=(),
-        rate_hz=RATE_HZ,
-        n_ticks=WORLD.n_ticks,
-        radiance_gain=GAIN,
-        targets=(),
-        sensor={"model": "toy", "rows_bottom_up": True},
-        source={"kind": "recorder"},
-    )
-    finish_scene(root, description)
+    about = {"id": "toy", "title": "A toy world", "licence": "CC0-1.0", "source": {"kind": "recorder"}}
+    clock = {"rate_hz": RATE_HZ, "n_ticks": WORLD.n_ticks, "radiance_gain": GAIN}
+    array = {"cameras": cameras, "train": tuple(c.id for c in cameras), "test": (), "targets": ()}
+    sensor = {"model": "toy", "rows_bottom_up": True}
+    finish_scene(root, SceneDescription(**about, **clock, **array, sensor=sensor))
     return root
 
 
@@ -128,20 +118,12 @@ def test_a_fit_leaves_a_model_a_sheet_a_video_and_a_report(fitted: Path) -> None
 
 def test_the_report_is_one_page_that_needs_no_network(fitted: Path) -> None:
     page = (fitted / REPORT).read_text()
-    assert (
-        not re.search(r"(src|href)=\"(?!data:(?:image/png;base64)?,|(?:video\.mp4|sheet\.png)\")", page)
-        and "url(" not in page
-    )
+    own = r"data:(?:image/png;base64)?,|(?:video\.mp4|sheet\.png)\""
+    assert not re.search(rf"(src|href)=\"(?!{own})", page) and "url(" not in page
     assert page.count("<img") == 2 and "<script" not in page
     text = re.sub(r"<[^>]+>", " ", re.sub(r"base64,[^\"]+", "", page))
-    for words in (
-        "given by the scene",
-        "not a score",
-        "60 ticks at 20000 Hz: 3 ms",
-        "tfp+4dgs on toy",
-        "torch",
-        "cpu:",
-    ):
+    said = ("given by the scene", "not a score", "60 ticks at 20000 Hz: 3 ms", "tfp+4dgs on toy", "torch", "cpu:")
+    for words in said:
         assert words in text
     rows = table_rows(page, "cam_")
     assert [row[0] for row in rows] == [c.id for c in WORLD.training.cameras]
@@ -288,10 +270,7 @@ def test_what_cannot_be_done_is_said(fitted: Path, recorded: Path, tmp_path: Pat
         (("--out", str(tmp_path / "a"), "--method", "nearest-view"), "a method whose models can be saved"),
         (("--out", str(tmp_path / "b"), "--method", "magic"), "one of "),
         (("--out", str(tmp_path / "c"), "--budget", "much"), "--budget"),
-        (
-            ("--out", str(tmp_path / "e"), "--set", "images.time_spacing_ticks=0"),
-            "time_spacing_ticks and max_times of 1",
-        ),
+        (("--out", str(tmp_path / "e"), "--set", "images.time_spacing_ticks=0"), "_ticks and max_times of 1"),
         (("--out", str(tmp_path / "e"), "--set", "density.refine_every=0"), "refine_every of 1 step or more"),
         (("--out", str(tmp_path / "f"), "--set", "trainer.lr_last=0"), "learning rates above 0"),
     ):

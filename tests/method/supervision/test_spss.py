@@ -13,20 +13,14 @@ from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.splat.ssim import ssim
+from spike4dgs.method.supervision import spss
 from spike4dgs.method.supervision.base import Sample, Supervision
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, fire, random_charge, recorded
-from spike4dgs.method.supervision.spss import (
-    FLOOR,
-    SpikeVariation,
-    SpikeVariationSettings,
-    first_sequence,
-    window_moments,
-)
 from spike4dgs.method.supervision.table import SUPERVISIONS
 
 WORLD = ToyWorld(width=32, height=20, side=2, n_ticks=120)
-SETTINGS = SpikeVariationSettings()
+SETTINGS = spss.SpikeVariationSettings()
 VIEWS = (0, 2)
 
 
@@ -47,7 +41,7 @@ def every_pixel(phi: torch.nn.Linear, spike: torch.Tensor) -> tuple[torch.Tensor
     """Eq. 16 as written: phi_s on (H, W, 1) gives (H, W, Gamma), of which average and deviation are taken."""
     sequence = phi(spike[..., None]).sigmoid()
     average = sequence.mean(-1)
-    return average, ((sequence - average[..., None]).square().mean(-1) + FLOOR).sqrt()
+    return average, ((sequence - average[..., None]).square().mean(-1) + spss.FLOOR).sqrt()
 
 
 def other_phi(ticks: int, seed: int) -> torch.nn.Linear:
@@ -67,7 +61,7 @@ def test_the_table_gives_the_values_and_gradients_of_phi_on_every_pixel(seed: in
     counts = torch.randint(0, levels + 1, (2, 5, 6), generator=g).double()
     weights = torch.randn(2, 2, 5, 6, generator=g).double()
     results = []
-    for f in (lambda s: window_moments(phi, s, levels), lambda s: every_pixel(phi, s)):
+    for f in (lambda s: spss.window_moments(phi, s, levels), lambda s: every_pixel(phi, s)):
         spike = (counts / levels).requires_grad_()
         average, deviation = f(spike)
         loss = (weights[0] * average + weights[1] * deviation).sum()
@@ -80,12 +74,12 @@ def test_surrogate_gradient_is_that_of_the_mean_over_all_charges() -> None:
     """Over all charges the average of the window is a smooth function of the rate: a staircase with Gamma steps, of
     which the mean slope over one step is compared."""
     phi, levels, n = torch.nn.Linear(1, 40).double(), 256, 8000
-    first_sequence(phi)
+    spss.first_sequence(phi)
     charge = torch.rand(n, generator=torch.Generator().manual_seed(0)).double()
     spread = (torch.arange(n).double() + 0.5) / n - 0.5
 
     def average(rate: torch.Tensor) -> torch.Tensor:
-        return window_moments(phi, fire(rate, charge, levels) / levels, levels)[0].mean()
+        return spss.window_moments(phi, fire(rate, charge, levels) / levels, levels)[0].mean()
 
     for value in (0.08, 0.31, 0.55, 0.93):
         rate = (value + spread / 40).requires_grad_()
@@ -99,10 +93,10 @@ def test_surrogate_gradient_is_that_of_the_mean_over_all_charges() -> None:
 @pytest.mark.parametrize("ticks", [8, 40, 200])
 def test_phi_begins_as_the_sequence_of_an_even_stream(ticks: int) -> None:
     phi = torch.nn.Linear(1, ticks).double()
-    first_sequence(phi)
+    spss.first_sequence(phi)
     s = torch.arange(257).double() / 256
     with torch.no_grad():
-        average, deviation = window_moments(phi, s, 256)
+        average, deviation = spss.window_moments(phi, s, 256)
         assert float((average - s).abs().max()) < 0.5 / ticks
         middle = slice(32, -32)
         torch.testing.assert_close(deviation[middle], (s * (1 - s)).sqrt()[middle], rtol=0, atol=1.2 / ticks)
@@ -116,13 +110,13 @@ def test_the_whole_loss_is_equations_14_to_18(tick: int) -> None:
     found = float(loss(lambda t: rendered, sample(tick, step, target)).detach())
     charge = random_charge(rendered, step).numpy()
     spike = run_neurons(GAIN * rendered.numpy(), charge, SETTINGS.neuron_ticks) / SETTINGS.neuron_ticks
-    (variation,) = (m for m in loss.modules() if isinstance(m, SpikeVariation))
+    (variation,) = (m for m in loss.modules() if isinstance(m, spss.SpikeVariation))
     average, deviation = (m.detach().numpy() for m in every_pixel(variation.phi, torch.from_numpy(spike)))
     window = slice(max(0, tick - 20), min(120, tick + 20))
     seen = np.stack([scene.streams[v].window(window.start, window.stop) for v in VIEWS]).astype(np.float64)
     expected = np.abs(rendered.numpy() - target.numpy()).mean()
     expected += np.abs(average - seen.mean(1)).mean()
-    expected += np.abs(deviation - np.sqrt(seen.var(1) + FLOOR)).mean()
+    expected += np.abs(deviation - np.sqrt(seen.var(1) + spss.FLOOR)).mean()
     assert found == pytest.approx(expected, rel=1e-6)
 
 
@@ -147,7 +141,7 @@ def test_sums_render_once_and_add_up() -> None:
         return float(loss(render, sample(60, 1, target)).detach())
 
     pixel, spike = value(make("pixel")), value(make("spike"))
-    variation = value(SpikeVariation(SETTINGS, WORLD.training))
+    variation = value(spss.SpikeVariation(SETTINGS, WORLD.training))
     calls.clear()
     assert value(make("pixel+spike")) == pytest.approx(pixel + spike, rel=1e-6)
     assert value(make("spss")) == pytest.approx(pixel + variation, rel=1e-6)
@@ -223,7 +217,7 @@ def test_one_binary_spike_draws_rates_to_one_half_and_a_value_of_many_ticks_to_t
     scene = gray_scene(0.3 / GAIN, np.ones((20, 32)), 0.0, False)  # 0.3 spikes per tick
     ends = {}
     for ticks in (1, 256):
-        loss = SpikeVariation(replace(SETTINGS, neuron_ticks=ticks), scene)
+        loss = spss.SpikeVariation(replace(SETTINGS, neuron_ticks=ticks), scene)
         slopes = []
         for rate in (0.26, 0.34, 0.46, 0.54):
             gray = torch.full((2, 20, 32), rate / GAIN, requires_grad=True)

@@ -8,20 +8,11 @@ import torch
 from toy_world import ToyWorld
 
 from spike4dgs.method.splat import Views
-from spike4dgs.method.training_views.changes import (
-    COUNTS,
-    MASKS,
-    POINTS,
-    RAYS,
-    ChangeSettings,
-    changing,
-    variation,
-    without_specks,
-)
+from spike4dgs.method.training_views import changes
 from spike4dgs.method.training_views.points import project
 
 
-def averaged(images: torch.Tensor, s: ChangeSettings) -> np.ndarray:
+def averaged(images: torch.Tensor, s: changes.ChangeSettings) -> np.ndarray:
     """Images blurred plainly, one shift of the window after another."""
     reach, found = s.blur_px // 2, images.double().numpy()
     height, width = found.shape[2:]
@@ -34,40 +25,40 @@ def averaged(images: torch.Tensor, s: ChangeSettings) -> np.ndarray:
     return summed(found) / (s.blur_px**2 if s.zeros_outside else summed(np.ones_like(found)))
 
 
-@pytest.mark.parametrize("s", [POINTS, MASKS, RAYS])
-def test_variation_is_the_deviation_of_blurred_images(s: ChangeSettings) -> None:
+@pytest.mark.parametrize("s", [changes.POINTS, changes.MASKS, changes.RAYS])
+def test_variation_is_the_deviation_of_blurred_images(s: changes.ChangeSettings) -> None:
     images = torch.rand(5, 2, 8, 9, generator=torch.Generator().manual_seed(1))
     tolerance = 1e-12 if s.float64 else 1e-6
-    np.testing.assert_allclose(variation(images, s), averaged(images, s).std(axis=0), atol=tolerance)
+    np.testing.assert_allclose(changes.variation(images, s), averaged(images, s).std(axis=0), atol=tolerance)
 
 
 def test_a_pixel_changes_above_the_limit() -> None:
     images = torch.zeros(2, 1, 1, 3)
     images[1, 0, 0] = torch.tensor([0.079, 0.081, 0.5])
-    assert changing(images, RAYS).tolist() == [[[False, True, True]]]
+    assert changes.changing(images, changes.RAYS).tolist() == [[[False, True, True]]]
 
 
 def test_counts_of_constant_radiance_do_not_change() -> None:
     counts = torch.full((4, 1, 2, 2), 20)
     counts[1, 0, 0] += torch.tensor([1, 2])
     counts[2, 0, 1] += torch.tensor([-2, 3])
-    assert changing(counts, COUNTS).tolist() == [[[False, False], [False, True]]]
+    assert changes.changing(counts, changes.COUNTS).tolist() == [[[False, False], [False, True]]]
 
 
 def test_the_limit_of_masks_follows_the_noise_within_its_bounds() -> None:
     g = torch.Generator().manual_seed(0)
     for noise, limit in ((1e-4, 0.01), (0.015, None), (0.3, 0.05)):
         images = 0.5 + noise * torch.randn(30, 1, 40, 50, generator=g)
-        found = variation(images, MASKS)
-        expected = limit or MASKS.noise_factor * float(np.quantile(found, MASKS.noise_share))
+        found = changes.variation(images, changes.MASKS)
+        expected = limit or changes.MASKS.noise_factor * float(np.quantile(found, changes.MASKS.noise_share))
         assert 0.01 <= expected <= 0.05
-        assert torch.equal(changing(images, MASKS), found > expected)
+        assert torch.equal(changes.changing(images, changes.MASKS), found > expected)
 
 
 def test_single_pixels_are_specks() -> None:
     mask = np.zeros((9, 9), bool)
     mask[2, 2] = mask[4:8, 4:8] = True
-    cleaned = without_specks(mask)
+    cleaned = changes.without_specks(mask)
     assert not cleaned[:4, :4].any() and cleaned[5:7, 5:7].all()
 
 

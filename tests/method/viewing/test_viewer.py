@@ -157,15 +157,8 @@ def test_whose_pages_are_the_viewers_own(host: str, origin: str | None, asked: s
 def test_a_page_of_another_origin_gets_no_socket(viewer: Viewer) -> None:
     def status(origin: str) -> bytes:
         host, _, port = viewer.url.removeprefix("http://").partition(":")
-        lines = (
-            "GET / HTTP/1.1",
-            f"Host: {host}:{port}",
-            f"Origin: {origin}",
-            "Upgrade: websocket",
-            "Connection: Upgrade",
-            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
-            "Sec-WebSocket-Version: 13",
-        )
+        lines = ["GET / HTTP/1.1", f"Host: {host}:{port}", f"Origin: {origin}", "Upgrade: websocket"]
+        lines += ["Connection: Upgrade", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13"]
         with socket.create_connection(("127.0.0.1", int(port)), 30) as connection:
             connection.sendall("\r\n".join([*lines, "", ""]).encode())
             return connection.recv(12)

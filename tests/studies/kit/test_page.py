@@ -7,11 +7,8 @@ from devtools import Page
 from spike4dgs.studies.kit.page import write_page_of
 
 GROUP = "Images from spikes"
-COLUMNS = [
-    {"id": "share", "title": "share, %", "log": True},
-    {"id": "ms", "title": "time, ms", "log": True},
-    {"id": "error", "title": "error, radiance", "log": True},
-]
+TITLES = {"share": "share, %", "ms": "time, ms", "error": "error, radiance"}
+COLUMNS = [{"id": column, "title": title, "log": True} for column, title in TITLES.items()]
 
 
 def result(id: str, series: list[Any], **changes: Any) -> dict[str, Any]:
@@ -28,14 +25,8 @@ def points(*rows: tuple[str, str, float | None, float | None]) -> list[dict[str,
 def page(tmp_path: Path, *results: dict[str, Any]) -> str:
     machine = {"cpu": "a CPU, 2 cores", "gpu": None, "python": "3.11", "platform": "Linux", "packages": {"numpy": "2"}}
     harness = {"version": "0", "commit": "abc", "dirty": True}
-    report = {
-        "size": "tiny",
-        "seed": 3,
-        "device": "cpu",
-        "started": "then",
-        "finished": "now",
-        "command": "spike4dgs x",
-    }
+    times = {"started": "then", "finished": "now"}
+    report = {"size": "tiny", "seed": 3, "device": "cpu", **times, "command": "spike4dgs x"}
     write_page_of(tmp_path / "i.html", {**report, "environment": machine, "harness": harness, "measurements": results})
     return (tmp_path / "i.html").read_text()
 

@@ -11,15 +11,7 @@ from PIL import Image
 from scipy.stats import ttest_rel
 
 from spike4dgs.benchmark.method import get_method
-from spike4dgs.studies.results.blocks import (
-    NINE,
-    NO_LEAD,
-    NOTHING,
-    headline_block,
-    lead_block,
-    scenes_block,
-    table_block,
-)
+from spike4dgs.studies.results import blocks
 from spike4dgs.studies.results.comparison import lead, rank, rows_of
 from spike4dgs.studies.results.pages import BLOCKS
 from spike4dgs.studies.results.plan import TABLE1, TABLE2, Group, Row, track_scenes
@@ -124,15 +116,15 @@ planned cells, all finite, and 1 that failed. Tuned on: here (`spike4dgs-x`); el
 
 
 def test_the_text_of_a_table_is_this() -> None:
-    assert "\n".join(table_block(GROUP, made())) == GOLDEN.strip()
+    assert "\n".join(blocks.table_block(GROUP, made())) == GOLDEN.strip()
 
 
 def test_the_text_of_the_scenes_has_every_row_and_its_gaps() -> None:
-    lines = scenes_block(GROUP, made())
+    lines = blocks.scenes_block(GROUP, made())
     assert "| row | bricks | chips | turntable | bird |" in lines
     assert "| `spike4dgs-x` | 38.05 / 40.05 | 39.05 / 41.05 | 40.05 / 42.05 | 41.05 / 43.05 |" in lines
     assert "| `c` | 50.00 / 52.00 | - | - | - |" in lines
-    assert lines[-1] == table_block(GROUP, made())[-1]
+    assert lines[-1] == blocks.table_block(GROUP, made())[-1]
 
 
 def test_a_lead_is_over_the_best_complete_row_with_equal_knowledge() -> None:
@@ -143,7 +135,7 @@ def test_a_lead_is_over_the_best_complete_row_with_equal_knowledge() -> None:
             else r
             for r in made()
         ]
-        return lead_block(GROUP, moved)[2]
+        return blocks.lead_block(GROUP, moved)[2]
 
     assert sentence(0).startswith(
         "- `spike4dgs-x`, calibrated: 4.95 ± 0.18 dB ahead of `a` where things move, and 4.95"
@@ -152,10 +144,10 @@ def test_a_lead_is_over_the_best_complete_row_with_equal_knowledge() -> None:
     assert "calibrated: 1.05 ± 0.18 dB behind `a` where things move, and" in sentence(-6)
     assert "`c`" not in sentence(0) and "tfp+stg" not in sentence(0)
     headline = f"- calibrated, {sentence(0).removeprefix('- ').replace(', calibrated', '')}"
-    assert headline_block(GROUP, made()) == [headline, "", "Commit c0ffee000000."]
+    assert blocks.headline_block(GROUP, made()) == [headline, "", "Commit c0ffee000000."]
     nobody = [r for r in made() if r["row"] in (OURS, "tfp+stg", "c")]
-    for block in (lead_block, headline_block):
-        assert block(GROUP, nobody) == [NO_LEAD] and block(GROUP, []) == [NOTHING]
+    for block in (blocks.lead_block, blocks.headline_block):
+        assert block(GROUP, nobody) == [blocks.NO_LEAD] and block(GROUP, []) == [blocks.NOTHING]
 
 
 @pytest.mark.parametrize("scenes", [4, 9])
@@ -196,19 +188,19 @@ def test_seeds_that_not_every_scene_has_do_not_count() -> None:
 def test_a_table_has_the_seeds_of_its_plan() -> None:
     """A row that has three seeds for another table has one beside rows of one."""
     one = replace(GROUP, rows=tuple(replace(row, seeds=1) for row in GROUP.rows))
-    text = table_block(one, [*made(), *(record("a", s, 99.0, seed=1) for s in SCENES)])
-    assert text == table_block(one, [r for r in made() if r["seed"] == 0]) and "seed 0;" in text[-1]
+    text = blocks.table_block(one, [*made(), *(record("a", s, 99.0, seed=1) for s in SCENES)])
+    assert text == blocks.table_block(one, [r for r in made() if r["seed"] == 0]) and "seed 0;" in text[-1]
 
 
 def test_a_seed_that_few_scenes_have_is_on_no_scene() -> None:
     seeds = replace(GROUP, rows=(replace(Row("a"), seeds=2), *GROUP.rows[2:]))
     with_more = [*made(), record("a", SCENES[0], 99.0, seed=1)]
-    assert scenes_block(seeds, with_more)[:-1] == scenes_block(seeds, made())[:-1]
+    assert blocks.scenes_block(seeds, with_more)[:-1] == blocks.scenes_block(seeds, made())[:-1]
 
 
 def test_other_code_commits_and_changes_are_named() -> None:
     def last(**changes: Any) -> str:
-        return table_block(
+        return blocks.table_block(
             GROUP, [*(r for r in made() if r["row"] != "b"), *(record("b", s, 33, **changes) for s in SCENES)]
         )[-1]
 
@@ -240,15 +232,15 @@ def test_rows_with_networks_are_compared_with_those_of_the_same_weights_alone() 
 
 def test_cells_of_other_budgets_splits_and_scenes_are_not_of_the_table() -> None:
     changes = ({"budget": 4.0}, {"split": "corner"}, {"scene": "car-0-small"}, {"row": "else"})
-    assert table_block(GROUP, [{**record("a", SCENES[0], 30), **c} for c in changes]) == [NOTHING]
+    assert blocks.table_block(GROUP, [{**record("a", SCENES[0], 30), **c} for c in changes]) == [blocks.NOTHING]
 
 
 @pytest.mark.parametrize("name", BLOCKS)
 def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name: str) -> None:
-    assert BLOCKS[name]([]) == [NOTHING]
+    assert BLOCKS[name]([]) == [blocks.NOTHING]
     of = {
         "breaks": ON_CONDITIONS,
-        "cameras": replace(TRACK_SMALL, scenes=(*TRACK_SMALL.scenes, *NINE.scenes)),
+        "cameras": replace(TRACK_SMALL, scenes=(*TRACK_SMALL.scenes, *blocks.NINE.scenes)),
         "conditions": ON_CONDITIONS,
         "content": CONTENT,
         "covisible": TRACK_SMALL,
@@ -259,7 +251,7 @@ def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name
         "steps": STEPS[0],
         "table2": TABLE2,
     }
-    scenes = of.get(name.removesuffix("-scenes"), NINE).scenes
+    scenes = of.get(name.removesuffix("-scenes"), blocks.NINE).scenes
     rows = SHOWN.get(name, ("spike4dgs-x", "tfp+rig-flat+stg"))
     split = {"split": "views-3"} if name == "table5" else {}
     text = "\n".join(BLOCKS[name]([record(row, s, 30 + k, **split) for row in rows for k, s in enumerate(scenes)]))
@@ -323,8 +315,8 @@ def test_table_5_has_a_column_for_each_number_of_views():
 
 
 def test_pairs_count_the_scenes_on_which_the_first_is_ahead():
-    found = [record("tfp+stg", s, 30.0 + k) for k, s in enumerate(NINE.scenes)]
-    found += [record("tfp+4dgs", s, 32.0 + 0.5 * k) for k, s in enumerate(NINE.scenes)]
+    found = [record("tfp+stg", s, 30.0 + k) for k, s in enumerate(blocks.NINE.scenes)]
+    found += [record("tfp+4dgs", s, 32.0 + 0.5 * k) for k, s in enumerate(blocks.NINE.scenes)]
     lines = pairs_block(found)
     assert lines[2] == "| `tfp+stg` | `tfp+4dgs` | +0.00 | 4 | +0.00 | 4 |"
     assert "18 of 54 planned cells" in lines[-1], "of the rows that are shown"
@@ -529,8 +521,8 @@ def test_sensors_are_ranked_where_things_move_beside_the_bits_they_send(tmp_path
 
 
 def test_what_ours_reaches_on_each_scene_and_in_the_mean():
-    found = [record(OURS, scene, 30.0 + k, seed) for k, scene in enumerate(NINE.scenes) for seed in (0, 1)]
-    lines = own_scenes_block([*found, record("a", NINE.scenes[0], 50.0)])
+    found = [record(OURS, scene, 30.0 + k, seed) for k, scene in enumerate(blocks.NINE.scenes) for seed in (0, 1)]
+    lines = own_scenes_block([*found, record("a", blocks.NINE.scenes[0], 50.0)])
     assert lines[2] == "| jaywalk | 32.00 | 0.9700 | 30.00 | 0.9600 | 0.050 | - |"
     assert lines[11] == "| **mean** | 36.00 | 0.9700 | 34.00 | 0.9600 | 0.050 | - |"
     assert "18 of 27 planned cells" in lines[-1]
