@@ -167,17 +167,6 @@ def zero_quaternions() -> tuple[Splats, Views]:
     return changed(s, quats=quats), views()
 
 
-HARD: list[Callable[[], tuple[Splats, Views]]] = [
-    near_plane,
-    needles,
-    pancakes,
-    tiny_and_huge,
-    opacities,
-    equal_depths,
-    off_screen,
-    nothing,
-    far_origin,
-    opaque_stack,
-    zero_quaternions,
-    behind,
-]
+Hard = Callable[[], tuple[Splats, Views]]
+HARD: list[Hard] = [near_plane, needles, pancakes, tiny_and_huge, opacities, equal_depths, off_screen, nothing]
+HARD += [far_origin, opaque_stack, zero_quaternions, behind]

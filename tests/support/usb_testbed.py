@@ -14,33 +14,17 @@ LIBRARIES = (PRELOAD, "libumockdev.so.0", "libgobject-2.0.so.0", "libusb-1.0.so.
 class Urb(c.Structure):
     """struct usbdevfs_urb of a 64-bit kernel."""
 
-    _fields_ = [
-        ("type", c.c_uint8),
-        ("endpoint", c.c_uint8),
-        ("status", c.c_int),
-        ("flags", c.c_uint),
-        ("buffer", c.c_void_p),
-        ("buffer_length", c.c_int),
-        ("actual_length", c.c_int),
-        ("start_frame", c.c_int),
-        ("number_of_packets", c.c_int),
-        ("error_count", c.c_int),
-        ("signr", c.c_uint),
-        ("usercontext", c.c_void_p),
-    ]
+    _fields_ = [("type", c.c_uint8), ("endpoint", c.c_uint8), ("status", c.c_int), ("flags", c.c_uint)]
+    _fields_ += [("buffer", c.c_void_p)]
+    _fields_ += [(name, c.c_int) for name in ("buffer_length", "actual_length", "start_frame", "number_of_packets")]
+    _fields_ += [("error_count", c.c_int), ("signr", c.c_uint), ("usercontext", c.c_void_p)]
 
 
 class Memory(c.Structure):
     """struct UMockdevIoctlData (a GObject): a copy of the client's memory at `client_addr`."""
 
-    _fields_ = [
-        ("g_class", c.c_void_p),
-        ("ref_count", c.c_uint),
-        ("qdata", c.c_void_p),
-        ("data", c.c_void_p),
-        ("data_len", c.c_int),
-        ("client_addr", c.c_ulong),
-    ]
+    _fields_ = [("g_class", c.c_void_p), ("ref_count", c.c_uint), ("qdata", c.c_void_p), ("data", c.c_void_p)]
+    _fields_ += [("data_len", c.c_int), ("client_addr", c.c_ulong)]
 
 
 def _ioctl(number: int, size: int = 0, direction: int = 2) -> int:

@@ -231,26 +231,22 @@ def test_an_array_in_its_own_frame_is_the_same_array() -> None:
         np.testing.assert_allclose(after.project(move(points))[0], before.project(points)[0], atol=1e-6)
 
 
-def test_streams_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
-    streams = {}
-    for name, ticks in (("a", 8), ("b", 9)):
-        with SpikeWriter(tmp_path / f"{name}.dat", 8, 8) as writer:
-            writer.write(np.zeros((ticks, 8), np.uint8))
-        streams[name] = SpikeStream(np.zeros((ticks, 8), np.uint8), 8, 8, RATE_HZ)
-    write_stream_folder(tmp_path, streams)
+def test_streams_that_do_not_belong_together_or_are_dark_are_refused(tmp_path: Path) -> None:
+    def write(side: int, **ticks: int) -> None:
+        streams = {}
+        for name, count in ticks.items():
+            with SpikeWriter(tmp_path / f"{name}.dat", side, side) as writer:
+                writer.write(np.zeros((count, side * side // 8), np.uint8))
+            streams[name] = SpikeStream(np.zeros((count, side * side // 8), np.uint8), side, side, RATE_HZ)
+        write_stream_folder(tmp_path, streams)
+
+    write(8, a=8, b=9)
     with pytest.raises(UserError, match="two or more streams of one size, rate and length"):
         open_recording(tmp_path)
-    write_stream_folder(tmp_path, {"a": streams["a"]})
+    write(8, a=8)
     with pytest.raises(UserError, match=r"found 1 stream\(s\)"):
         open_recording(tmp_path)
-
-
-def test_dark_streams_have_no_poses(tmp_path: Path) -> None:
-    dark = SpikeStream(np.zeros((8, 96 * 60 // 8), np.uint8), 96, 60, RATE_HZ)
-    for name in "ab":
-        with SpikeWriter(tmp_path / f"{name}.dat", 96, 60) as writer:
-            writer.write(dark.packed)
-    write_stream_folder(tmp_path, dict.fromkeys("ab", dark))
+    write(64, a=8, b=8)
     with pytest.raises(UserError, match="expected two cameras that recorded spikes, in most ticks, found 0"):
         open_recording(tmp_path)
 

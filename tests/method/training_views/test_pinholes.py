@@ -17,16 +17,7 @@ from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.images.adaptive import ADAPTIVE
 from spike4dgs.method.images.training import ImageSettings, make_training_images
 from spike4dgs.method.models.fitted_model import FittedModel
-from spike4dgs.method.training_views.pinholes import (
-    as_pinholes,
-    lenses_of,
-    make_lenses,
-    nearest_pixels,
-    seen_pixels,
-    through_lens,
-    undistorted,
-    with_lenses,
-)
+from spike4dgs.method.training_views import pinholes
 
 BARREL, CUSHION = (-0.5, 0.1, 0.002, -0.003, 0.0), (0.3, 0.0, 0.0, 0.0, 0.0)
 CURVED = ToyWorld(n_ticks=120, travel=0.0, lens=BARREL)
@@ -40,7 +31,7 @@ def wave(camera: Camera) -> np.ndarray:
 
 
 class Waves:
-    @through_lens
+    @pinholes.through_lens
     def render(self, camera: Camera, t_us: float) -> np.ndarray:
         assert not camera.distortion
         return wave(camera)
@@ -54,7 +45,7 @@ def scene_of(*cameras: Camera) -> TrainingScene:
 @pytest.mark.parametrize("lens", [BARREL, CUSHION, (-0.2, 0.0, 0.0, 0.0, 0.0)])
 def test_a_pinhole_sees_all_that_its_camera_sees(lens: tuple[float, ...]) -> None:
     cameras = [replace(c, distortion=lens, cx=c.cx + k) for k, c in enumerate(CURVED.cameras[:3])]
-    found = make_lenses(cameras)
+    found = pinholes.make_lenses(cameras)
     assert len({(x.pinhole.width, x.pinhole.height) for x in found}) == 1
     for camera, x in zip(cameras, found, strict=True):
         uv = x.to_pinhole.reshape(-1, 2)
@@ -71,10 +62,10 @@ def test_a_pinhole_sees_all_that_its_camera_sees(lens: tuple[float, ...]) -> Non
 @pytest.mark.parametrize("lens", [BARREL, CUSHION])
 def test_images_go_to_the_pinhole_and_back(lens: tuple[float, ...]) -> None:
     cameras = [replace(c, distortion=lens) for c in CURVED.cameras[:2]]
-    scene = as_pinholes(scene_of(*cameras))
+    scene = pinholes.as_pinholes(scene_of(*cameras))
     images = np.stack([wave(c) for c in cameras])
-    straight = undistorted(scene, images[None])[0]
-    expected, seen = np.stack([wave(c) for c in scene.cameras]), seen_pixels(scene)
+    straight = pinholes.undistorted(scene, images[None])[0]
+    expected, seen = np.stack([wave(c) for c in scene.cameras]), pinholes.seen_pixels(scene)
     assert seen is not None
     assert np.sqrt(np.mean((straight - expected)[np.stack(seen)] ** 2)) < 3e-3
     assert np.isfinite(straight).all()
@@ -84,9 +75,11 @@ def test_images_go_to_the_pinhole_and_back(lens: tuple[float, ...]) -> None:
 
 
 def test_spikes_and_masks_keep_their_values() -> None:
-    scene = as_pinholes(scene_of(*[replace(c, distortion=BARREL) for c in CURVED.cameras[:2]]))
+    scene = pinholes.as_pinholes(scene_of(*[replace(c, distortion=BARREL) for c in CURVED.cameras[:2]]))
     spikes = [s.window(0, 3) for s in scene.streams]
-    for found, lens, given in zip(nearest_pixels(scene, spikes), lenses_of(scene), spikes, strict=True):
+    for found, lens, given in zip(
+        pinholes.nearest_pixels(scene, spikes), pinholes.lenses_of(scene), spikes, strict=True
+    ):
         assert found.dtype == np.uint8 and found.shape == (3, lens.pinhole.height, lens.pinhole.width)
         v, u = np.argwhere(lens.seen)[50]
         x, y = lens.to_camera[v, u].astype(int)
@@ -95,17 +88,17 @@ def test_spikes_and_masks_keep_their_values() -> None:
 
 def test_a_scene_of_pinholes_stays_as_it_is() -> None:
     scene = ToyWorld(n_ticks=16).training
-    assert as_pinholes(scene) is scene and seen_pixels(scene) is None
+    assert pinholes.as_pinholes(scene) is scene and pinholes.seen_pixels(scene) is None
     images = np.zeros((2, 8, 40, 64), np.float32)
-    assert undistorted(scene, images) is images
-    assert with_lenses(scene, scene.cameras) == scene.cameras
+    assert pinholes.undistorted(scene, images) is images
+    assert pinholes.with_lenses(scene, scene.cameras) == scene.cameras
 
 
 def test_fitted_pinholes_become_cameras_with_their_lens() -> None:
     cameras = [replace(c, distortion=BARREL) for c in CURVED.cameras[:2]]
-    scene = as_pinholes(scene_of(*cameras))
+    scene = pinholes.as_pinholes(scene_of(*cameras))
     moved = [replace(c, t=c.t + 0.1, fx=c.fx * 1.01) for c in scene.cameras]
-    for found, given in zip(with_lenses(scene, moved), cameras, strict=True):
+    for found, given in zip(pinholes.with_lenses(scene, moved), cameras, strict=True):
         np.testing.assert_allclose(found.t, given.t + 0.1)
         np.testing.assert_allclose([found.fx, found.cx, found.cy], [given.fx * 1.01, given.cx, given.cy])
         assert found.distortion == BARREL and (found.width, found.height) == (given.width, given.height)
@@ -113,7 +106,7 @@ def test_fitted_pinholes_become_cameras_with_their_lens() -> None:
 
 def test_a_lens_that_folds_within_the_image_is_refused() -> None:
     with pytest.raises(UserError, match="a lens of cam_00 whose model holds up to the image's corners"):
-        make_lenses([replace(CURVED.cameras[0], distortion=(-5.0, 0.0, 0.0, 0.0, 0.0))])
+        pinholes.make_lenses([replace(CURVED.cameras[0], distortion=(-5.0, 0.0, 0.0, 0.0, 0.0))])
 
 
 def test_training_images_are_at_the_pixels_of_the_streams() -> None:
@@ -143,7 +136,7 @@ def test_a_fit_through_a_lens_gives_straight_images_and_bent_ones(supervision: s
     assert psnr(known, CURVED.held_out) > 24
     assert psnr(known, straight) > 24
     if supervision == "pixel":
-        pinholes = tuple(replace(c, distortion=()) for c in curved.cameras)
-        assert psnr(method.fit(replace(curved, cameras=pinholes), request()), straight) < 18, "the lens matters"
+        without = tuple(replace(c, distortion=()) for c in curved.cameras)
+        assert psnr(method.fit(replace(curved, cameras=without), request()), straight) < 18, "the lens matters"
     assert isinstance(known, FittedModel)
     assert [c.distortion for c in known.cameras] == [BARREL] * len(curved.cameras)
