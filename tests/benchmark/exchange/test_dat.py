@@ -14,11 +14,9 @@ import pytest
 import yaml
 from small_scenes import HEIGHT, TICKS, WIDTH, array_cameras, shared_file
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import Camera, UserError, open_scene
 from spike4dgs.benchmark.exchange.dat import import_dat
 from spike4dgs.benchmark.exchange.recording import Recording
-from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import pack
 from spike4dgs.cli import main
@@ -40,12 +38,13 @@ def write_streams(folder: Path, names: Sequence[str], ticks: int = TICKS) -> dic
     return made
 
 
-def write_colmap(folder: Path, distortion: Sequence[float] | None = None, names: Sequence[str] = ()) -> Path:
+def write_colmap(folder: Path, lens: str = "PINHOLE", more: Sequence[float] = (), names: Sequence[str] = ()) -> Path:
     model = pycolmap.Reconstruction()
     for i, c in enumerate(CAMERAS, start=1):
-        lens = ("PINHOLE", []) if distortion is None else ("OPENCV", list(distortion[:4]))
-        params = [c.fx, c.fy, c.cx, c.cy, *lens[1]]
-        camera = pycolmap.Camera(camera_id=i, model=lens[0], width=c.width, height=c.height, params=params)
+        focal = [c.fx] if "RADIAL" in lens else [c.fx, c.fy]
+        camera = pycolmap.Camera(
+            camera_id=i, model=lens, width=c.width, height=c.height, params=[*focal, c.cx, c.cy, *more]
+        )
         model.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(image_id=i, camera_id=i, name=(names or [f"{c.id}.png" for c in CAMERAS])[i - 1])
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t))
@@ -106,9 +105,8 @@ def test_colmap_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     spikes = write_streams(tmp_path / "in", ["cam_00", "cam_02"])
     for kind in ("text", "binary"):
         model = write_colmap(tmp_path / kind)
-        import_dat(
-            tmp_path / "in", **SIZE, recording=Recording(20000.0, 0.5), cameras=model, out=tmp_path / f"{kind}-out"
-        )
+        known = {**SIZE, "recording": Recording(20000.0, 0.5), "cameras": model}
+        import_dat(tmp_path / "in", **known, out=tmp_path / f"{kind}-out")
         assert "no stream of cam_01: left out" in capsys.readouterr().out
         scene = open_scene(tmp_path / f"{kind}-out")
         assert scene.train == ("cam_00", "cam_02") and scene.test == () and scene.radiance_gain == 0.5
@@ -168,7 +166,7 @@ def test_lens_distortion_is_kept(tmp_path: Path, kind: str, capsys: pytest.Captu
 
     def written(name: str, coefficients: np.ndarray) -> Path:
         if kind == "colmap":
-            return write_colmap(tmp_path / name, coefficients)
+            return write_colmap(tmp_path / name, "OPENCV", coefficients[:4])
         if kind == "opencv":
             return write_opencv(tmp_path / f"{name}.yml", coefficients)
         return write_kalibr(tmp_path / f"{name}.yml", "radtan", coefficients[:4].tolist())
@@ -193,17 +191,9 @@ def test_lens_distortion_is_kept(tmp_path: Path, kind: str, capsys: pytest.Captu
 @pytest.mark.parametrize(("model", "lens"), [("SIMPLE_RADIAL", [0.05]), ("RADIAL", [0.05, -0.01])])
 def test_radial_colmap_cameras(tmp_path: Path, model: str, lens: list[float]) -> None:
     write_streams(tmp_path / "in", ["cam_00"])
-    c, made = CAMERAS[0], pycolmap.Reconstruction()
-    params = [c.fx, c.cx, c.cy, *lens]
-    made.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model=model, width=c.width, height=c.height, params=params)
-    )
-    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t)
-    made.add_image_with_trivial_frame(pycolmap.Image(image_id=1, camera_id=1, name="cam_00"), pose)
-    (tmp_path / "model").mkdir()
-    made.write_binary(str(tmp_path / "model"))
-    import_dat(tmp_path / "in", **STATED, cameras=tmp_path / "model", out=tmp_path / "out")
-    expected = np.array([made.image(1).project_point(p) for p in POINTS])
+    cameras = write_colmap(tmp_path / "model", model, lens)
+    import_dat(tmp_path / "in", **STATED, cameras=cameras, out=tmp_path / "out")
+    expected = np.array([pycolmap.Reconstruction(str(cameras)).image(1).project_point(p) for p in POINTS])
     assert np.abs(open_scene(tmp_path / "out").cameras["cam_00"].project(POINTS)[0] - expected).max() < 1e-6
 
 

@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import HEIGHT, TICKS, WIDTH, array_cameras
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import export_spikecv, import_spikecv
 from spike4dgs.benchmark.scene.cameras import to_nerfstudio
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import pack
 from spike4dgs.cli import main
@@ -38,9 +37,7 @@ def random_spikes(n: int, height: int, width: int, seed: int = 0) -> np.ndarray:
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 1100), st.integers(1, 9), st.integers(8, 21), st.integers(0, 9))
-def test_import_of_any_size_and_length(
-    tmp_path_factory: pytest.TempPathFactory, n: int, height: int, width: int, seed: int
-) -> None:
+def test_any_size_imports(tmp_path_factory: pytest.TempPathFactory, n: int, height: int, width: int, seed: int) -> None:
     root = tmp_path_factory.mktemp("spikecv")
     spikes = random_spikes(n, height, width, seed)
     import_spikecv(write_spikecv(root / "cam", spikes), root / "out", Recording(40000.0))
@@ -73,35 +70,24 @@ def test_a_scene_goes_out_and_comes_back(small_scene: Path, tmp_path: Path, caps
     assert len(back.training.streams) == 4
 
 
-def test_export_has_no_padding_and_rows_bottom_up(tmp_path: Path) -> None:
-    spikes = random_spikes(30, 5, 13)
-    cameras = array_cameras(1, 13, 5)
-    transforms = tmp_path / "poses.json"
-    top = to_nerfstudio(cameras[0])
-    pose = {"camera": "cam", "transform_matrix": top.pop("transform_matrix")}
-    transforms.write_text(json.dumps({**top, "frames": [pose]}))  # intrinsics once at the top
-    source = write_spikecv(tmp_path / "cam", spikes[:, ::-1])
-    import_spikecv(source, tmp_path / "scene", Recording(20000.0, rows_top_down=True), transforms)
-    assert (tmp_path / "scene/spikes/cam.dat").read_bytes() == pack(spikes, rows_bottom_up=False).tobytes()
-    assert "rows top-down" in (tmp_path / "scene/README.md").read_text()
-    export_spikecv(open_scene(tmp_path / "scene"), tmp_path / "out")
-    expected = np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").tobytes()
-    assert (tmp_path / "out/cam/cam.dat").read_bytes() == expected
-
-
 @settings(max_examples=12, deadline=None)
 @given(st.integers(1, 1100), st.integers(1, 9), st.integers(8, 21), st.booleans(), st.integers(0, 9))
 def test_a_scene_of_any_size_goes_out_and_comes_back(
     tmp_path_factory: pytest.TempPathFactory, n: int, height: int, width: int, top_down: bool, seed: int
 ) -> None:
     root, spikes = tmp_path_factory.mktemp("spikecv"), random_spikes(n, height, width, seed)
-    poses = {"frames": [{"camera": "cam", **to_nerfstudio(array_cameras(1, width, height)[0])}]}
-    (root / "poses.json").write_text(json.dumps(poses))
+    top = to_nerfstudio(array_cameras(1, width, height)[0])
+    pose = {"camera": "cam", "transform_matrix": top.pop("transform_matrix")}
+    (root / "poses.json").write_text(json.dumps({**top, "frames": [pose]}))  # intrinsics once at the top
     known = Recording(20000.0), root / "poses.json"
     source = write_spikecv(root / "cam", spikes[:, ::-1] if top_down else spikes)
     import_spikecv(source, root / "scene", replace(known[0], rows_top_down=top_down), known[1])
     np.testing.assert_array_equal(open_scene(root / "scene").stream("cam").window(0, n), spikes)
+    assert (root / "scene/spikes/cam.dat").read_bytes() == pack(spikes, rows_bottom_up=not top_down).tobytes()
+    assert f"rows {'top-down' if top_down else 'bottom-up'}" in (root / "scene/README.md").read_text()
     export_spikecv(open_scene(root / "scene"), root / "out")
+    no_padding = np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").tobytes()
+    assert (root / "out/cam/cam.dat").read_bytes() == no_padding
     import_spikecv(root / "out", root / "back", *known)
     np.testing.assert_array_equal(open_scene(root / "back").stream("cam").window(0, n), spikes)
 
