@@ -52,9 +52,12 @@ def test_results_come_in_order(workers):
     assert max(calls for _, calls, _ in found) >= 10 / workers  # one task object for each worker
 
 
-def test_a_worker_that_dies_is_one_error():
-    with executor(2) as run, pytest.raises(UserError, match="a worker process.*run the same command again"):
-        list(run(die, [[1], [2], [3]]))
+@pytest.mark.parametrize(
+    ("task", "message"), [(die, "a worker process.*run the same command again"), (fail, "Switch it on")]
+)
+def test_errors_of_tasks_come_through_and_a_worker_that_dies_is_one(task, message):
+    with executor(2) as run, pytest.raises(UserError, match=message):
+        list(run(task, [[1], [2], [3]]))
 
 
 def first_ends_last(chunk):
@@ -75,11 +78,6 @@ def test_unordered_results_come_as_they_end_with_their_positions(tmp_path):
     assert all(set(share) <= set(mine) for share in shares)
     if len(mine) > 1:
         assert sum(map(len, shares)) <= len(mine), "workers share no core"
-
-
-def test_errors_of_tasks_come_through():
-    with executor(2) as run, pytest.raises(UserError, match="Switch it on"):
-        list(run(fail, [[1], [2]]))
 
 
 def has_ended(pid):

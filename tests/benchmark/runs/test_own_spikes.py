@@ -10,18 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from changes import edit_json
-from small_scenes import TICKS
+from small_scenes import HEIGHT, TICKS, WIDTH
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import METRICS, Scene, Target, UserError, open_scene
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.metrics.measure import select_metrics
-from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.held_out import SPIKE_METRICS, has_truth, targets_of
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter, write_predictions
 from spike4dgs.benchmark.runs.record import Cell, check_record, read_record, with_later_metrics, write_record
 from spike4dgs.benchmark.runs.score import open_for, score_predictions, score_scene
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.cli import main
 
 CHOSEN = select_metrics(("psnr", *SPIKE_METRICS))
@@ -29,9 +27,7 @@ CHOSEN = select_metrics(("psnr", *SPIKE_METRICS))
 
 def predict(folder: Path, scene: Scene, targets: tuple[Target, ...], truth: Scene, noise: float = 0.0) -> Path:
     """Write predictions: the pattern of the small scenes at the targets' ticks, and noise."""
-    rng = np.random.default_rng(5)
-    height, width = (scene.cameras[targets[0].camera].height, scene.cameras[targets[0].camera].width)
-    y, x = np.mgrid[:height, :width].astype(np.float64)
+    rng, (y, x) = np.random.default_rng(5), np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
     with PredictionWriter(folder) as writer:
         for t in targets:
             image = 0.45 + 0.3 * np.sin((x - 0.1 * t.tick - 2 * int(t.camera[-1])) / 4) * np.cos(y / 5)
@@ -76,9 +72,8 @@ def test_a_recording_is_scored_by_its_spikes_alone(small_scene: Path, tmp_path: 
     write_record(tmp_path / "r.json", record)
     assert read_record(tmp_path / "r.json") == record
     cell = record["scenes"][scene.id]
-    assert {m for m, v in cell["metrics"].items() if v is not None} == {
-        m for m in SPIKE_METRICS if not m.endswith("_dynamic")
-    }
+    found = {m for m, v in cell["metrics"].items() if v is not None}
+    assert found == {m for m in SPIKE_METRICS if not m.endswith("_dynamic")}
     assert cell["gain_aligned"] is None and "psnr" not in cell["computed"]
     assert cell["notes"]["psnr"] == "not computed: the scene has no ground truth"
     assert cell["notes"]["spike_deviance_dynamic"] == "no image has a moving region and its ticks recorded"

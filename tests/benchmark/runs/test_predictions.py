@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from changes import edit_json, flip_bit
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import Target, UserError
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.runs.predictions import (
     INFO,
@@ -20,7 +20,6 @@ from spike4dgs.benchmark.runs.predictions import (
     PredictionWriter,
     open_predictions,
 )
-from spike4dgs.benchmark.scene.scene import Target
 
 TARGETS = tuple(Target("cam_03", t) for t in (20, 40, 60, 80, 100, 120, 140))
 METHOD = MethodInfo("tfp+4dgs", "1.2", {"steps": 3}, 0, ("some data",))
@@ -117,18 +116,13 @@ def test_a_flipped_byte_is_refused_by_name(folder: Path) -> None:
     found.read(TARGETS[1])
 
 
-@pytest.mark.parametrize("text", ["no hash\n", "ab  cam_03/000020.exr\n", "\n"])
-def test_damaged_sums_are_refused(folder: Path, text: str) -> None:
-    (folder / SUMS).write_text(text)
-    with pytest.raises(UserError, match=r"SHA256SUMS: expected lines .* found line 1"):
-        open_predictions(folder, TARGETS)
-
-
-def test_a_name_listed_twice_is_refused(folder: Path) -> None:
-    text = (folder / SUMS).read_text()
-    (folder / SUMS).write_text(text + text.splitlines()[0] + "\n")
-    with pytest.raises(UserError, match="line 8"):
-        open_predictions(folder, TARGETS)
+def test_damaged_sums_and_a_name_listed_twice_are_refused(folder: Path) -> None:
+    whole = (folder / SUMS).read_text()
+    twice = whole + whole.splitlines()[0] + "\n"
+    for text, line in (("no hash\n", 1), ("ab  cam_03/000020.exr\n", 1), ("\n", 1), (twice, 8)):
+        (folder / SUMS).write_text(text)
+        with pytest.raises(UserError, match=rf"SHA256SUMS: expected lines .* found line {line}"):
+            open_predictions(folder, TARGETS)
 
 
 def test_missing_parts_are_named(folder: Path, tmp_path: Path) -> None:
@@ -164,9 +158,7 @@ def test_the_smallest_description_of_another_program_is_enough(folder: Path) -> 
 )
 def test_a_bad_description_is_refused(folder: Path, key: str, value: object, found_at: str) -> None:
     edit_json(folder / INFO, lambda info: info.update({key: value}))
-    with pytest.raises(
-        UserError, match=rf"prediction\.json: expected a valid spike4dgs-prediction/1, found at {found_at}"
-    ):
+    with pytest.raises(UserError, match=rf"prediction\.json: expected a valid .*prediction/1, found at {found_at}"):
         open_predictions(folder, TARGETS)
 
 

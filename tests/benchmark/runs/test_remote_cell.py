@@ -30,12 +30,10 @@ from dummy_methods import (
 from nosy_methods import Refines
 from small_scenes import write_small_scene
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import Budget, UserError, get_method, open_scene
 from spike4dgs.benchmark.files import locked
-from spike4dgs.benchmark.method import Budget, get_method
 from spike4dgs.benchmark.runs.cell import Failure, Job
 from spike4dgs.benchmark.runs.remote_cell import Fitted, Order, SharedFolder, fit_order, make_order, store
-from spike4dgs.benchmark.scene.scene import open_scene
 
 PSNR: dict[str, Any] = {"metrics": ("psnr",)}
 

@@ -9,10 +9,8 @@ from typing import Any
 import pytest
 from dummy_methods import CountMethod, FailingMethod, run
 
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark import METRICS, UserError, records_to_dataframe
 from spike4dgs.benchmark.runs.record import COSTS
-from spike4dgs.benchmark.runs.results import records_to_dataframe
 
 pytest.importorskip("pandas")
 
@@ -25,10 +23,8 @@ def records(small_scene: Path, tmp_path: Path) -> list[dict[str, Any]]:
 
 def test_a_row_is_a_method_on_a_scene(records: list[dict[str, Any]], tmp_path: Path) -> None:
     frame = records_to_dataframe(*records)
-    assert frame[["method", "seed", "scene", "split", "status"]].values.tolist() == [
-        ["counts", 3, "pattern-0", "center", "ok"],
-        ["bad", 3, "pattern-0", "center", "failed"],
-    ]
+    rows = [[name, 3, "pattern-0", "center", status] for name, status in (("counts", "ok"), ("bad", "failed"))]
+    assert frame[["method", "seed", "scene", "split", "status"]].values.tolist() == rows
     assert [c for c in frame.columns if c in METRICS or c in COSTS] == [*METRICS, *COSTS]
     assert frame["psnr"][0] == records[0]["scenes"]["pattern-0"]["metrics"]["psnr"]
     assert frame["psnr"].isna().tolist() == [False, True] and "no luck" in frame["error"][1]
@@ -45,9 +41,7 @@ def test_a_row_may_be_an_image(records: list[dict[str, Any]]) -> None:
     assert "fit_seconds" not in frame
 
 
-def test_without_pandas_one_line_says_how_to_install_it(
-    records: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pandas_one_line_says_so(records: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(UserError, match=r"the package pandas, found none; pip install 'spike4dgs\[pandas\]'"):
         records_to_dataframe(*records)

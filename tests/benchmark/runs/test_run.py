@@ -22,16 +22,14 @@ from dummy_methods import CountMethod, FailingMethod, prediction_bytes, without_
 from rich.console import Console
 from small_scenes import write_small_scene
 
+from spike4dgs.benchmark import Budget, FitRequest, TrainingScene, UserError, get_method, open_scene
 from spike4dgs.benchmark import method as recipes
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget, FitRequest, get_method
 from spike4dgs.benchmark.runs.cell import FitClock, Job
 from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.record import check_record, of_scenes
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.images import read_exr, write_exr, write_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.weights import WeightsError
 
 run = partial(dummy_methods.run, metrics=("psnr",))
@@ -328,9 +326,7 @@ def test_a_damaged_scene_is_refused_before_any_work(small_scene: Path, tmp_path:
 
 
 @pytest.mark.parametrize("kind", ["images", "masks"])
-def test_a_truth_that_was_exchanged_is_not_scored_under_the_first_ones_revision(
-    small_scene: Path, tmp_path: Path, kind: str
-) -> None:
+def test_exchanged_truth_is_not_scored_under_the_first_revision(small_scene: Path, tmp_path: Path, kind: str) -> None:
     revision = open_scene(small_scene).revision
     if kind == "images":
         name = "images/cam_03/000040.exr"

@@ -22,14 +22,12 @@ from nosy_methods import LacksWeights, LooksAround, PlaysBack, Refines, Swaps
 from rich.console import Console
 from small_scenes import write_small_scene
 
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget, get_method
+from spike4dgs.benchmark import Budget, UserError, get_method, open_scene
 from spike4dgs.benchmark.runs.apart.fit import Apart, _environment, _training_part, fit_apart
 from spike4dgs.benchmark.runs.apart.messages import packed_method, unpacked_method
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.scene.scene import open_scene
 
 PSNR: dict[str, Any] = {"metrics": ("psnr",)}
 APART: dict[str, Any] = {"apart": Apart(), **PSNR}
@@ -57,10 +55,8 @@ def test_the_bits_are_those_of_a_fit_in_this_process(small_scene: Path, tmp_path
     assert prediction_bytes(tmp_path / "apart") == prediction_bytes(tmp_path / "here")
     assert [without_timings(r) for r in apart] == [without_timings(r) for r in here]
     assert all((tmp_path / mode / "models/tfp+static/pattern-0.safetensors").is_file() for mode in ("here", "apart"))
-    info, other = (
-        json.loads((tmp_path / mode / "predictions/tfp+static/pattern-0/prediction.json").read_text())
-        for mode in ("here", "apart")
-    )
+    paths = [tmp_path / mode / "predictions/tfp+static/pattern-0/prediction.json" for mode in ("here", "apart")]
+    info, other = (json.loads(path.read_text()) for path in paths)
     for key in ("key", "scene_revision", "split", "scene", "method", "budget"):
         assert info[key] == other[key], key
     assert other["fit_seconds"] > 0 and other["render_fps"] > 0 and other["peak_memory_mb"] > 10
@@ -91,16 +87,10 @@ def test_what_a_fit_sees_has_neither_the_held_out_camera_nor_how_the_scene_was_m
     cell = cell_of(run(tmp_path / "out", [made_scene], LooksAround(seen), **APART))
     assert cell["status"] == "ok"
     found = json.loads(seen.read_text())
-    assert found["files"] == [
-        "README.md",
-        "croissant.json",
-        "manifest.json",
-        "scene.json",
-        *(f"sparse/0/{name}.bin" for name in ("cameras", "frames", "images", "points3D", "rigs")),
-        *(f"spikes/cam_0{i}.dat" for i in range(3)),
-        "targets.json",
-        *(f"transforms_{name}.json" for name in ("all", "test", "train")),
-    ]
+    wanted = ["README.md", *(f"{name}.json" for name in ("croissant", "manifest", "scene", "targets"))]
+    wanted += [f"sparse/0/{name}.bin" for name in ("cameras", "frames", "images", "points3D", "rigs")]
+    wanted += [f"spikes/cam_0{i}.dat" for i in range(3)]
+    assert found["files"] == sorted(wanted + [f"transforms_{name}.json" for name in ("all", "test", "train")])
     assert not found["links"], "symbolic links say where the scene lies"
     assert {found["names"][f"spikes/cam_0{i}.dat"] for i in range(3)} == {2}, "no copies"
     text = json.dumps({key: found[key] for key in ("texts", "scene", "folder", "argv", "input")})
@@ -110,9 +100,8 @@ def test_what_a_fit_sees_has_neither_the_held_out_camera_nor_how_the_scene_was_m
     assert str(made_scene.parent) not in {found["environment"].get(name) for name in ("PWD", "SPIKE4DGS_RELEASE")}
     assert found["scene"][:2] == ["scene", scene.revision]
     training = scene.training.cameras
-    assert found["cameras"] == [
-        [c.id, *c.K.ravel().tolist(), *c.R.ravel().tolist(), *c.t.tolist()] for c in training
-    ], "poses to the last bit"
+    exact = [[c.id, *c.K.ravel().tolist(), *c.R.ravel().tolist(), *c.t.tolist()] for c in training]
+    assert found["cameras"] == exact, "poses to the last bit"
     captured = capfd.readouterr()
     assert "printed to standard output" in captured.err and "printed" not in captured.out
 
@@ -192,9 +181,7 @@ GOOD = '["rendered", {"fit_seconds": 1, "render_fps": 1, "peak_memory_mb": 1, "m
         (GOOD, "expected an image of a target, found none"),
     ],
 )
-def test_a_process_that_says_what_it_must_not_fails_its_cell(
-    small_scene: Path, tmp_path: Path, line: str, message: str
-) -> None:
+def test_a_process_that_lies_fails_its_cell(small_scene: Path, tmp_path: Path, line: str, message: str) -> None:
     (tmp_path / "said").write_text(line + "\n")
     liar = Apart(f"sh -c 'cat {tmp_path}/said; exec cat > {os.devnull}'")  # in the place of our program
     cell = cell_of(run(tmp_path / "out", [small_scene], CountMethod(), apart=liar, **PSNR))
@@ -208,9 +195,7 @@ def test_a_link_in_the_place_of_an_image_is_refused(small_scene: Path, tmp_path:
     assert cell["status"] == "failed" and "expected an image of a target" in cell["error"]
 
 
-def test_a_process_that_is_killed_fails_its_cell_and_the_next_run_goes_on_with_it(
-    small_scene: Path, tmp_path: Path
-) -> None:
+def test_a_process_that_is_killed_fails_its_cell_and_the_next_run_goes_on(small_scene: Path, tmp_path: Path) -> None:
     (tmp_path / "bullet").touch()
     killer = WorkerKiller("killer", tmp_path)
     killed, other = run(tmp_path / "out", [small_scene], killer, CountMethod(), **APART)

@@ -53,9 +53,7 @@ def test_points_are_there_for_those_that_are_given_points(scene: Scene, tmp_path
     assert files_in(scene.root) == before, "no link was written through"
 
 
-def test_where_the_disk_has_no_links_files_are_copied(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_disks_without_links_get_copies(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: Any, **kwargs: Any) -> None:
         raise OSError("no links here")
 
