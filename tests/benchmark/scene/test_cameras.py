@@ -72,12 +72,6 @@ def test_projection_is_the_textbook_product(camera: Camera) -> None:
 
 
 @given(cameras())
-def test_nerfstudio_and_back_projects_to_the_same_pixels(camera: Camera) -> None:
-    frame = to_nerfstudio(camera)
-    assert worst_px(camera, from_nerfstudio("cam_00", frame), seen_points(camera)) < 0.01
-
-
-@given(cameras())
 def test_nerfstudio_poses_mean_opengl_axes(camera: Camera) -> None:
     """Project with the OpenGL formula of nerfstudio itself: +y up, looking along -z."""
     frame = to_nerfstudio(camera)
@@ -114,10 +108,8 @@ def test_a_ray_of_mitsubas_sensor_hits_our_pixel(scalar_mitsuba: ModuleType, see
     mi = scalar_mitsuba
     rng = np.random.default_rng(seed)
     width, height = 64, 40
-    camera = look_at(
-        "c", rng.uniform(-3, 3, 3) + [0, -8, 0], rng.uniform(-1, 1, 3), np.array([0.0, 0, 1]), focal=70.0, width=width,
-        height=height,
-    )  # fmt: skip
+    origin, target, up = rng.uniform(-3, 3, 3) + [0, -8, 0], rng.uniform(-1, 1, 3), np.array([0.0, 0, 1])
+    camera = look_at("c", origin, target, up, focal=70.0, width=width, height=height)
     camera = dataclasses.replace(camera, cx=width * 0.45, cy=height * 0.56)
     film = {"type": "hdrfilm", "width": width, "height": height}
     to_world = mi.ScalarTransform4f(mitsuba_to_world(camera))

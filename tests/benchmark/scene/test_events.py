@@ -13,10 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.other_sensors import Events, EventStream, read_events, write_events
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.generators.other_sensors import THRESHOLD, events
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.streams import extras

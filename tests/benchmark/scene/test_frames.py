@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from small_scenes import HEIGHT, WIDTH, write_small_scene
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.generators.other_sensors import EXPOSURE_S, FPS, exposures
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.streams import extras

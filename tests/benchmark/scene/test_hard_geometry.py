@@ -29,10 +29,8 @@ _FOLDS = (-0.2, 0.0, 0.0, 0.0, 0.0)
 
 
 def _camera(lens: tuple[float, ...] = ()) -> Camera:
-    camera = look_at(
-        "c", np.array([0.3, -2.0, 1.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]), focal=90, width=80, height=50
-    )
-    return replace(camera, distortion=lens)
+    at, up = np.array([0.3, -2.0, 1.0]), np.array([0.0, 0.0, 1.0])
+    return replace(look_at("c", at, np.zeros(3), up, focal=90, width=80, height=50), distortion=lens)
 
 
 @pytest.mark.hard_case(
@@ -231,13 +229,10 @@ def test_files_geometry(hard_case: HardCase) -> None:
 def test_files_refuse(hard_case: HardCase) -> None:
     path, one = hard_case.folder / "bad.exr", np.ones((4, 4), np.float32)
     nan_depth = np.where(np.eye(4) > 0, np.nan, one).astype(np.float32)
-    calls = {
-        f"radiance {value}": lambda value=value: write_exr(path, one * np.float32(value), 0.0)
-        for value in ("nan", "inf", "1e5")
-    }
-    calls["depth with NaN"] = lambda: write_geometry(
-        path, nan_depth, one.astype(np.uint32), np.zeros((4, 4, 2), np.float32), 0
-    )
+    bad = {f"radiance {value}": one * np.float32(value) for value in ("nan", "inf", "1e5")}
+    calls = {name: partial(write_exr, path, image, 0.0) for name, image in bad.items()}
+    ids, flow = one.astype(np.uint32), np.zeros((4, 4, 2), np.float32)
+    calls["depth with NaN"] = partial(write_geometry, path, nan_depth, ids, flow, 0.0)
     hard_case.refused(calls)
 
 

@@ -17,13 +17,11 @@ from rich.console import Console
 from run_command import run_benchmark
 from small_scenes import HEIGHT, WIDTH, array_cameras, write_small_scene
 
-from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget
+from spike4dgs.benchmark import Budget, Target, UserError, open_scene
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.scene.scene import Target, open_scene
 from spike4dgs.benchmark.scene.splits import Split, spread_order, standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
 from spike4dgs.cli import main
@@ -84,9 +82,7 @@ def test_no_array_around_the_held_out_camera(cameras: tuple[Camera, ...]) -> Non
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=2, max_size=12), st.data())
-def test_each_further_view_is_as_far_from_the_others_as_any(
-    positions: list[tuple[float, float]], data: st.DataObject
-) -> None:
+def test_each_further_view_is_as_far_from_the_others_as_any(positions: list[tuple[float, float]], data: Any) -> None:
     cameras = at(*positions)
     held_out = data.draw(st.sampled_from(cameras)).id
     order = spread_order(cameras, held_out)
@@ -139,9 +135,8 @@ def test_the_files_say_which_images_belong_to_which_split(scene: Path, tmp_path:
     assert targets["splits"] == {"corner": [{"camera": "cam_00", "tick": t} for t in (30, 50)]}
     plain = write_small_scene(tmp_path / "plain")
     assert "splits" not in json.loads((plain / "targets.json").read_text())
-    frames = {
-        name: json.loads((scene / f"transforms_{name}.json").read_text())["frames"] for name in ("train", "test", "all")
-    }
+    files = {name: scene / f"transforms_{name}.json" for name in ("train", "test", "all")}
+    frames = {name: json.loads(path.read_text())["frames"] for name, path in files.items()}
     assert [f["file_path"] for f in frames["train"]] == [f"spikes/{c}.dat" for c in names(0, 1, 2)]
     test = [f["file_path"] for f in frames["test"]]
     assert test == ["spikes/cam_03.dat"] + [f"images/cam_03/0000{t}.exr" for t in (20, 40, 60)]
@@ -209,23 +204,16 @@ def test_records_and_predictions_name_their_split(scene: Path, tmp_path: Path) -
     assert set(corner["scenes"]["pattern-0"]["per_image"]) == {"cam_00/000030", "cam_00/000050"}
     info = json.loads((tmp_path / "b/predictions/counts/pattern-0/prediction.json").read_text())
     assert info["split"] == "corner"
-    assert (
-        run(tmp_path / "c", scene, "center")["scenes"]["pattern-0"]["metrics"]
-        == (center["scenes"]["pattern-0"]["metrics"])
-    )
+    named = run(tmp_path / "c", scene, "center")
+    assert named["scenes"]["pattern-0"]["metrics"] == center["scenes"]["pattern-0"]["metrics"]
 
 
 def test_each_split_has_its_own_content_key(scene: Path) -> None:
-    keys = {
-        Job(CountMethod(), open_scene(scene, split=split), 0, "cpu", Budget()).key
-        for split in ("center", "corner", "views-3")
-    }
-    assert len(keys) == 3
+    opened = [open_scene(scene, split=split) for split in ("center", "corner", "views-3")]
+    assert len({Job(CountMethod(), one, 0, "cpu", Budget()).key for one in opened}) == 3
 
 
-def test_predictions_of_another_split_are_refused(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_other_splits_predictions_are_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(tmp_path, scene, "views-3")
     folder = tmp_path / "predictions/counts/pattern-0"
     assert main(["score", str(folder), str(scene)]) == 2
