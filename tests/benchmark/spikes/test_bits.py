@@ -1,4 +1,4 @@
-"""Bit kernels against numpy's unpackbits."""
+"""Bit kernels against numpy's unpackbits, and one tick of the camera's model: the same compiled as in Python."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.spikes import bits
+from spike4dgs.benchmark.spikes.sensor_model import charge_after_spike, charge_of_tick
 
 
 def reference(packed: np.ndarray, width: int, height: int, flip: bool) -> np.ndarray:
@@ -59,3 +60,16 @@ def test_an_error_in_a_thread_is_raised() -> None:
 
     with pytest.raises(ValueError):
         bits.in_threads(fail, 10)
+
+
+TICKS = [(0.3, 0.01, 1.0, 0.31), (-0.2, 0.01, 1.0, 0.0), (3.0, 0.01, 1.25, 1.25)]
+SPIKES = [(1.2, 1.0, 1.2 - 1.0), (1.25, 1.25, 0.0), (2.5, 1.0, 1 - 2.0**-31)]
+
+
+@pytest.mark.parametrize(("function", "cases"), [(charge_of_tick, TICKS), (charge_after_spike, SPIKES)])
+def test_scalars_arrays_and_compiled_code_agree(function, cases):
+    *arguments, expected = np.array(cases).T
+    np.testing.assert_array_equal(function(*arguments), expected)
+    assert [function(*row) for row in zip(*arguments, strict=True)] == expected.tolist()
+    compiled = bits.kernel(function)
+    assert [compiled(*row) for row in zip(*arguments, strict=True)] == expected.tolist()

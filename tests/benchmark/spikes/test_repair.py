@@ -12,22 +12,9 @@ from hypothesis import strategies as st
 from memory import STATUS, resident_bytes
 from slow_likely import slow_likely
 
+from spike4dgs.benchmark.spikes import repair
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.likely_spikes import MOST
-from spike4dgs.benchmark.spikes.repair import (
-    EVEN,
-    FAR_EVEN,
-    HIDDEN,
-    LENGTH,
-    LONE,
-    LONGEST_TICKS,
-    NEAR_TICKS,
-    PLACE,
-    STEADY,
-    TIE,
-    fill_gaps,
-    fill_pixels,
-)
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 
 WIDTH, HEIGHT, TICKS = 21, 6, 400
@@ -51,7 +38,7 @@ RATES = np.linspace(0.02, 0.95, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
 
 def test_dropped_ticks_under_constant_light_cost_next_to_nothing():
     spikes, gaps = steady(RATES), [(t, 1) for t in range(7, TICKS - 2, 23)]
-    filled = fill_gaps(stream_of(spikes, gaps))
+    filled = repair.fill_gaps(stream_of(spikes, gaps))
     assert not filled.gaps
     lost = sum(int(spikes[t].sum()) for t, _ in gaps)
     before, after = (np.abs(s - spikes.sum(0)).mean() for s in (_counts(stream_of(spikes, gaps)), _counts(filled)))
@@ -69,40 +56,39 @@ def _counts(stream):
 
 def test_a_long_gap_goes_on_at_the_rate_and_remains_listed():
     spikes = steady(RATES)
-    filled = fill_gaps(stream_of(spikes, [(100, 60), (200, 3)]))
+    filled = repair.fill_gaps(stream_of(spikes, [(100, 60), (200, 3)]))
     assert [(g.first_tick, g.ticks) for g in filled.gaps] == [(100, 60)]
-    assert [(g.first_tick, g.ticks) for g in filled.filled] == [(100, 60), (200, 3)] and fill_gaps(filled).filled == (
-        filled.filled
-    )
-    assert np.abs(_counts(filled) - spikes.sum(0)).max() <= 1 + 60 / NEAR_TICKS
+    assert [(g.first_tick, g.ticks) for g in filled.filled] == [(100, 60), (200, 3)]
+    assert repair.fill_gaps(filled).filled == filled.filled
+    assert np.abs(_counts(filled) - spikes.sum(0)).max() <= 1 + 60 / repair.NEAR_TICKS
     assert not filled.certain[:60].any() and filled.certain[60:].any(), "what a long gap held is never certain"
-    np.testing.assert_array_equal(fill_gaps(filled).certain, filled.certain)
+    np.testing.assert_array_equal(repair.fill_gaps(filled).certain, filled.certain)
 
 
 @pytest.mark.parametrize("gap", [(0, 30), (370, 30), (0, 400)])
 def test_gaps_at_the_ends_take_the_rate_beside_them(gap):
     spikes = steady(RATES)
-    filled = fill_gaps(stream_of(spikes, [gap]))
+    filled = repair.fill_gaps(stream_of(spikes, [gap]))
     known = spikes.sum(0) if gap[1] < TICKS else 0
-    assert np.abs(_counts(filled) - known).max() <= 1 + 2 * 30 / NEAR_TICKS
+    assert np.abs(_counts(filled) - known).max() <= 1 + 2 * 30 / repair.NEAR_TICKS
 
 
 def test_a_gap_at_the_start_is_filled_as_one_at_the_end_of_the_reversed_stream():
     spikes = np.zeros((32, HEIGHT, WIDTH), np.uint8)
     spikes[:11] = 1
-    ends, begins = (fill_gaps(stream_of(s, [gap])) for s, gap in ((spikes, (12, 20)), (spikes[::-1], (0, 20))))
+    ends, begins = (repair.fill_gaps(stream_of(s, [gap])) for s, gap in ((spikes, (12, 20)), (spikes[::-1], (0, 20))))
     assert ends.window(12, 32)[:, 0, 0].tolist() == [1, 0] * 10, "the silent tick before the gap tells the interval"
     np.testing.assert_array_equal(begins.window(0, 32), ends.window(0, 32)[::-1])
 
 
 def even_train(times, lost):
     """Return the times that even spikes explain, away from the gap, and the bounds of their interval."""
-    even = EVEN if lost <= LONGEST_TICKS else FAR_EVEN
+    even = repair.EVEN if lost <= repair.LONGEST_TICKS else repair.FAR_EVEN
     kept, bounds = times[:1], (0.0, math.inf)
     for n, t in enumerate(times[1:], 1):
         distance = abs(t - times[0])
         bounds_n = max(bounds[0], (distance - even) / n), min(bounds[1], (distance + even) / n)
-        if abs(kept[-1] - times[0]) >= NEAR_TICKS or bounds_n[0] > bounds_n[1]:
+        if abs(kept[-1] - times[0]) >= repair.NEAR_TICKS or bounds_n[0] > bounds_n[1]:
             break
         kept, bounds = [*kept, t], bounds_n
     return kept, bounds
@@ -119,7 +105,7 @@ def nearest_places(lost, evens):
     out, free = [], list(lost)
     for i, e in enumerate(evens):
         near = free[: len(free) - (len(evens) - i - 1)]
-        tick = next(t for t in near if abs(t - e) <= min(abs(u - e) for u in near) + TIE)
+        tick = next(t for t in near if abs(t - e) <= min(abs(u - e) for u in near) + repair.TIE)
         out, free = [*out, tick], [t for t in free if t > tick]
     return out
 
@@ -132,24 +118,24 @@ def between(before, after, lost):
         return []
     length = (before[0] - before[-1] + after[-1] - after[0]) / n
     left = right = length
-    change = LONE * length
+    change = repair.LONE * length
     if len(before) > 1 and len(after) > 1:
         sides = (before[0] - before[-1]) / (len(before) - 1), (after[-1] - after[0]) / (len(after) - 1)
         change = (sides[1] - sides[0]) / 2
         if max(low[0], high[0]) > min(low[1], high[1]):
             (left, right), length = sides, sum(sides) / 2
     p, q = place(before, left), place(after, right)
-    guess = math.floor((q - p) / length + TIE) - 1
+    guess = math.floor((q - p) / length + repair.TIE) - 1
     found = [(math.inf, [])]
     for m in range(max(guess - 1, 0), min(max(guess, 0) + 2, len(lost)) + 1):
         evens = [p + (q - p) * i / (m + 1) for i in range(1, m + 1)]
         ticks = nearest_places(lost, evens)
-        variance = LENGTH + ((m + 1) * STEADY * length) ** 2 + (m + 1) * change**2
-        own = PLACE + (STEADY * length) ** 2 + change**2 / 4
+        variance = repair.LENGTH + ((m + 1) * repair.STEADY * length) ** 2 + (m + 1) * change**2
+        own = repair.PLACE + (repair.STEADY * length) ** 2 + change**2 / 4
         misfit = (q - p - (m + 1) * length) ** 2 / (2 * variance) + math.log(variance) / 2
-        off = [max(abs(t - e) - HIDDEN, 0) ** 2 / (2 * own) for t, e in zip(ticks, evens, strict=True)]
+        off = [max(abs(t - e) - repair.HIDDEN, 0) ** 2 / (2 * own) for t, e in zip(ticks, evens, strict=True)]
         found.append((misfit + sum(off), ticks))
-    return next(ticks for misfit, ticks in found if misfit <= min(found)[0] + TIE)
+    return next(ticks for misfit, ticks in found if misfit <= min(found)[0] + repair.TIE)
 
 
 def go_on(times, start, stop):
@@ -160,9 +146,9 @@ def go_on(times, start, stop):
     step = (times[0] - times[-1]) / (len(times) - 1)  # with its sign
     at = place(times, abs(step))
     silence = start - at if step > 0 else at - (stop - 1)
-    if silence >= 2 * abs(step) - TIE:
+    if silence >= 2 * abs(step) - repair.TIE:
         step = math.copysign(silence, step)
-    return [t for t in (math.floor(at + k * step + 0.5 + TIE) for k in range(1, TICKS)) if start <= t < stop]
+    return [t for t in (math.floor(at + k * step + 0.5 + repair.TIE) for k in range(1, TICKS)) if start <= t < stop]
 
 
 def twin(fired, lost):
@@ -214,7 +200,7 @@ def test_the_kernel_is_its_twin_whatever_is_lost(gaps, even, seed):
         lost[first : first + ticks] = True
     spikes[lost] = 0
     expected = np.array([twin(s, lost) for s in spikes.reshape(140, -1).T]).transpose(1, 2, 0)
-    stream = fill_gaps(stream_of(spikes, [(int(t), 1) for t in np.flatnonzero(lost)]))
+    stream = repair.fill_gaps(stream_of(spikes, [(int(t), 1) for t in np.flatnonzero(lost)]))
     sure = np.unpackbits(stream.certain, axis=1, count=rates.size, bitorder="little").reshape(-1, *size)
     found = stream.window(0, 140).reshape(140, -1), sure[:, ::-1].reshape(len(sure), -1)
     wrong = (found[0] != expected[0]).any(axis=0) | (found[1] != expected[1][lost]).any(axis=0)
@@ -225,7 +211,7 @@ def filled_ticks(spikes, lost):
     """Return what one pixel's lost ticks hold once they are filled."""
     fired = np.zeros((TICKS, HEIGHT, WIDTH), np.uint8)
     fired[spikes] = 1
-    found = fill_gaps(stream_of(fired, [(t, 1) for t in lost])).window(0, TICKS)[:, 0, 0]
+    found = repair.fill_gaps(stream_of(fired, [(t, 1) for t in lost])).window(0, TICKS)[:, 0, 0]
     return [t for t in lost if found[t]]
 
 
@@ -235,16 +221,14 @@ def test_a_lost_spike_lies_in_a_lost_tick():
     assert filled_ticks(every, [205]) == [205]
     assert filled_ticks(every, [203, 205, 212, 225]) == [205, 225], "several gaps between two spikes"
     assert filled_ticks(every, [201, 209]) == []
-    late = [
-        t if t <= 200 else t + 5 for t in every[:-1]
-    ]  # an interval of 15 ticks: light was lower, or a spike is lost
+    late = [t if t <= 200 else t + 5 for t in every[:-1]]  # an interval of 15 ticks: lower light, or a lost spike
     assert filled_ticks(late, [196]) == [], "far from the middle"
 
 
 def test_a_stream_without_gaps_is_itself():
     stream = stream_of(steady(RATES))
-    assert fill_gaps(stream) is stream and fill_pixels(stream, None) is stream
-    assert fill_pixels(stream, np.zeros((HEIGHT, WIDTH), bool)) is stream
+    assert repair.fill_gaps(stream) is stream and repair.fill_pixels(stream, None) is stream
+    assert repair.fill_pixels(stream, np.zeros((HEIGHT, WIDTH), bool)) is stream
 
 
 @pytest.mark.parametrize("bottom_up", [True, False])
@@ -255,7 +239,7 @@ def test_a_bad_pixel_fires_as_its_neighbour(bottom_up):
     stream = stream_of(np.where(bad, 1, spikes).astype(np.uint8), bottom_up=bottom_up)
     stream = replace(stream, packed=stream.packed.copy())
     stream.packed.flags.writeable = False
-    found = fill_pixels(stream, bad).window(0, TICKS)
+    found = repair.fill_pixels(stream, bad).window(0, TICKS)
     np.testing.assert_array_equal(found[:, ~bad], spikes[:, ~bad])
     for y, x in np.argwhere(bad):
         near = [(a, b) for a in range(y - 1, y + 2) for b in range(x - 1, x + 2) if 0 <= a < HEIGHT and 0 <= b < WIDTH]
@@ -267,7 +251,7 @@ def test_a_bad_pixel_is_as_certain_as_its_neighbour():
     bad[2, 3] = True
     spikes[:, 2, 3] = 0  # of which nothing is certain
     filled = fill_gaps(stream_of(spikes, [(t, 1) for t in range(7, TICKS - 2, 23)]))
-    certain = SpikeStream(fill_pixels(filled, bad).certain, WIDTH, HEIGHT, 2e4)
+    certain = SpikeStream(repair.fill_pixels(filled, bad).certain, WIDTH, HEIGHT, 2e4)
     sure = certain.window(0, certain.n_ticks)
     near = [sure[:, y, x].tolist() for y, x in ((1, 3), (3, 3), (2, 2), (2, 4))]
     assert sure[:, 2, 3].any() and sure[:, 2, 3].tolist() in near
@@ -281,14 +265,14 @@ def test_gaps_of_a_mapped_file_are_filled_next_to_it(tmp_path):
     path.write_bytes(np.random.default_rng(0).bytes(ticks * width * height // 8))
     stream = open_stream(path, width, height, 20000.0, gaps=gaps)
     in_memory = replace(stream, packed=np.array(stream.packed))
-    expected, content = fill_gaps(in_memory).packed, path.read_bytes()
+    expected, content = repair.fill_gaps(in_memory).packed, path.read_bytes()
     before = resident_bytes("RssAnon") if STATUS.is_file() else 0
-    filled = fill_gaps(stream)
+    filled = repair.fill_gaps(stream)
     if STATUS.is_file():
         assert resident_bytes("RssAnon") - before < len(content) / 4
     filled.release()
     np.testing.assert_array_equal(filled.packed, expected)
     assert path.read_bytes() == content and (filled.packed[100] != stream.packed[100]).any()
     part = replace(stream, packed=stream.packed[50:], gaps=(replace(gaps[0], first_tick=50),))
-    expected = fill_gaps(replace(part, packed=np.array(part.packed))).packed
-    np.testing.assert_array_equal(fill_gaps(part).packed, expected, err_msg="a part of a file's ticks")
+    expected = repair.fill_gaps(replace(part, packed=np.array(part.packed))).packed
+    np.testing.assert_array_equal(repair.fill_gaps(part).packed, expected, err_msg="a part of a file's ticks")
