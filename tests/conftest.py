@@ -1,7 +1,5 @@
 """Fixtures of all tests. Helper modules lie in `tests/support`, which pytest puts on the path."""
 
-from __future__ import annotations
-
 import gc
 import os
 

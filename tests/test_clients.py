@@ -1,7 +1,5 @@
 """`make clients`: how a client's values are judged. Its clients need environments, which that job makes."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

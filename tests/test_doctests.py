@@ -1,7 +1,5 @@
 """Examples run, and give what they say: in docstrings, the ten lines of README and docs, the quickstart's notebook."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import re

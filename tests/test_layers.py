@@ -1,7 +1,5 @@
 """The rules of the tree, enforced from the source: who may import whom, between the rooms and inside each of them."""
 
-from __future__ import annotations
-
 import ast
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """The public names of the rooms: each is found, and none is imported before it is used."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import subprocess

@@ -1,7 +1,5 @@
 """The package on systems other than Linux: what only Linux has is taken away, and the package is imported and used."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

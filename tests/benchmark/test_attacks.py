@@ -1,7 +1,5 @@
 """Files made to do harm, one test for each way: refused in one line, before anything is computed or written."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct

@@ -1,7 +1,5 @@
 """Compiled code is kept in the user's cache folder, one folder an install, and never beside the sources."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import shutil

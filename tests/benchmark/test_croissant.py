@@ -1,7 +1,5 @@
 """croissant.json against mlcroissant: it validates, its records can be read, its hashes are the manifest's."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Writing where it cannot be done: one line that says what to do, and nothing half written."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource

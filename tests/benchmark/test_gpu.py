@@ -1,7 +1,5 @@
 """Choosing the device where PyTorch sees a GPU: faked, on machines with and without one."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Methods of installed packages, found by entry point."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

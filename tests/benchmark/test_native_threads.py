@@ -4,8 +4,6 @@ OpenBLAS computes with the same kernels on every processor that has AVX2, so tha
 threads wait asleep.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

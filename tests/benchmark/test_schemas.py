@@ -1,7 +1,5 @@
 """Our schemas: fastjsonschema reads them as jsonschema does, and takes what we ship."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 `SPIKE4DGS_HOSTILE=10000` gives the readers as many; a failure names the case, the number and what was done to it.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

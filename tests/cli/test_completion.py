@@ -1,7 +1,5 @@
 """Completion scripts, as the shells themselves read them."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

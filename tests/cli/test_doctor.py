@@ -1,7 +1,5 @@
 """`doctor`, on this machine, on one without LLVM, and with parts that are missing or broken."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """`download weights` from a local server, with stand-ins of the files."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from unittest.mock import Mock

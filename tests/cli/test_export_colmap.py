@@ -1,7 +1,5 @@
 """The export as pycolmap reads it: the same pixels for points, the same images, and a way back by import-dat."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The export against an independent reading of the D-NeRF layout: the same pixels, images and times."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`images` on a bare stream, a folder of streams and a scene: what it writes, keeps, refuses and proposes."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`inspect` on streams whose bad pixels and intervals are known, and on the optional real recording."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`methods` lists what is installed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

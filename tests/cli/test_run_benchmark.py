@@ -1,7 +1,5 @@
 """`run-benchmark`, as the command line calls it."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -4,8 +4,6 @@ Pins are exact for the client and for what decides whether it runs. `bare` is in
 lists of SpikeCV and nerfstudio cannot be installed everywhere, and their readers need little of them.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

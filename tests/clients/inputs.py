@@ -9,8 +9,6 @@
 The other functions take this folder and return {value: numbers}; the script of a client returns the same names.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Iterator

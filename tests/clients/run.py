@@ -5,8 +5,6 @@ skipped with a reason; one that is there and fails, or computes another value, m
 printed, and written as OUT/table.md and OUT/clients.json.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Bare streams with cameras of COLMAP, OpenCV and Kalibr, which are compared with those programs' own projections."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

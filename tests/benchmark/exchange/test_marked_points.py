@@ -1,7 +1,5 @@
 """CSV files of points marked in images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """SpikeCV folders: round trips, the layout at sizes that are no whole bytes, and refused folders."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The text of JSON values."""
 
-from __future__ import annotations
-
 import pytest
 
 from spike4dgs.benchmark.json_values.text import json_text

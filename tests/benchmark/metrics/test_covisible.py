@@ -1,7 +1,5 @@
 """Co-visible pixels: against rays of a world in closed form, and as a scene is scored."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Hard inputs of the metrics: constant, equal, almost equal, HDR, black, tiny and broken images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from copy import deepcopy

@@ -1,7 +1,5 @@
 """What the held-out camera's own spikes say: the law of intervals, means over time, the view of a target."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Perceptual, no-reference and temporal metrics as a scene is scored: refusals, means, notes."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scenes and a release of them, in a few shards."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

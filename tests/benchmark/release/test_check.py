@@ -1,7 +1,5 @@
 """`release check` finds what is wrong with a release."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fingerprints of scenes: rounding is recognised, another noise and another world are not."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Packing, against tarfile, sha256sum and the grouping rule of WebDataset."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

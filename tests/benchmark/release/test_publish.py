@@ -1,7 +1,5 @@
 """Uploads to servers on this machine that speak as the hosts do."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

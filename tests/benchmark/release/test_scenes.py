@@ -1,7 +1,5 @@
 """Downloads from a local HTTP server that cuts, flips, fails, and from a process that is killed."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

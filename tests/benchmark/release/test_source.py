@@ -1,7 +1,5 @@
 """Answers that would take all memory: bodies without an end, and some that unpack to more than they have bytes."""
 
-from __future__ import annotations
-
 import gzip
 import tracemalloc
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The scenes of a track: found, fetched, or refused."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

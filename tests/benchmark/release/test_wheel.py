@@ -1,7 +1,5 @@
 """Wheels of releases: pip installs them, and their scenes open."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import zipfile

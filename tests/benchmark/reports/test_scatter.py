@@ -1,7 +1,5 @@
 """The scatter: labels can be read, and a floor does not set the axes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The sheet: every pixel is a scored one, scales are what they say, and text is text and inside the page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

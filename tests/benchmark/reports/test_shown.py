@@ -1,7 +1,5 @@
 """Error maps: colours and levels of known errors, and the choice of a scale."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

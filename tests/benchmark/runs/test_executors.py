@@ -1,7 +1,5 @@
 """Executors: the same results in the same order everywhere, and clear errors."""
 
-from __future__ import annotations
-
 import os
 import socket
 import time

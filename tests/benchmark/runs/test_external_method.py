@@ -1,7 +1,5 @@
 """A method of another package is found, fitted, scored and ranked; another program's images are scored and ranked."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import json

@@ -1,7 +1,5 @@
 """The digest of sources changes with their text and names, and with nothing else."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import ModuleType
 

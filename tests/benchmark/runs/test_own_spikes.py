@@ -1,7 +1,5 @@
 """Scenes scored by their held-out camera's own spikes: made ones, recorded ones without truth, damaged ones."""
 
-from __future__ import annotations
-
 import copy
 import json
 import shutil

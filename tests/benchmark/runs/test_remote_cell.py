@@ -1,7 +1,5 @@
 """Cells in other processes: the records of a serial run, whoever is killed on the way."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

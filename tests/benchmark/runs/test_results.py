@@ -1,7 +1,5 @@
 """Result records as a DataFrame: one row per method and scene, or per image."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

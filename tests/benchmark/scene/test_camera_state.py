@@ -1,7 +1,5 @@
 """A camera's state in an array: its clock, its gain, its bad pixels, and ticks of the array."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

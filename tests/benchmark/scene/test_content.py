@@ -1,7 +1,5 @@
 """A scene's revision changes with any bit of what is fitted or scored, and with nothing else."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import math

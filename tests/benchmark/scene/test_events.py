@@ -1,7 +1,5 @@
 """Events of an event camera: files come back, and what lies outside the clip or the image is refused."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,7 +1,5 @@
 """Frames of a conventional camera: a scene's files come back as images with their times."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Hard inputs of cameras, lenses, poses, clocks and image files."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

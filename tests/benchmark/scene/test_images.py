@@ -1,7 +1,5 @@
 """Image files: what is written is read back, gray and colour; files that are none are refused in one line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Lens distortion against OpenCV, on random and on hard lenses; resampling of images."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

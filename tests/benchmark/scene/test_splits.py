@@ -1,7 +1,5 @@
 """Splits: the standard ones of an array, scenes seen through them, and results that never mix."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training bursts on disk: the format, and damaged files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

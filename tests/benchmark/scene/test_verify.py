@@ -1,7 +1,5 @@
 """What a manifest says of contents is believed on opening, and checked by `verify`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

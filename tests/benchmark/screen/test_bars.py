@@ -1,7 +1,5 @@
 """Bars: the time left, and what a notebook shows."""
 
-from __future__ import annotations
-
 import io
 import sys
 import types

@@ -1,7 +1,5 @@
 """What an interpreter and a notebook show of public objects."""
 
-from __future__ import annotations
-
 import base64
 import importlib
 import io

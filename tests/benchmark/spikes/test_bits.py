@@ -1,7 +1,5 @@
 """Bit kernels against numpy's unpackbits, and one tick of the camera's model: the same compiled as in Python."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Counted recordings: every estimate equals that from the raw recording to the last bit."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from dataclasses import replace

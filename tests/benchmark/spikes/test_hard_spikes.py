@@ -1,7 +1,5 @@
 """Hard inputs of packed spike streams: odd sizes, extreme contents, long clips, gaps, damaged files."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hard_case import BYTES, REFUSAL, HardCase, described

@@ -1,7 +1,5 @@
 """Sizes are proposed by length and by rows that agree; right sizes raise no doubt."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from small_scenes import shared_file

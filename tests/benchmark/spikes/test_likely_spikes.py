@@ -1,7 +1,5 @@
 """Likely spikes: against a normal model of whole trains, and where a person would be certain."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings

@@ -1,7 +1,5 @@
 """Streams with gaps and bad pixels, against streams that never had any, and a float64 twin."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -250,7 +248,7 @@ def test_a_bad_pixel_is_as_certain_as_its_neighbour():
     spikes, bad = steady(RATES), np.zeros((HEIGHT, WIDTH), bool)
     bad[2, 3] = True
     spikes[:, 2, 3] = 0  # of which nothing is certain
-    filled = fill_gaps(stream_of(spikes, [(t, 1) for t in range(7, TICKS - 2, 23)]))
+    filled = repair.fill_gaps(stream_of(spikes, [(t, 1) for t in range(7, TICKS - 2, 23)]))
     certain = SpikeStream(repair.fill_pixels(filled, bad).certain, WIDTH, HEIGHT, 2e4)
     sure = certain.window(0, certain.n_ticks)
     near = [sure[:, y, x].tolist() for y, x in ((1, 3), (3, 3), (2, 2), (2, 4))]

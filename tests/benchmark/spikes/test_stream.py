@@ -1,7 +1,5 @@
 """Packed streams: layout, windows, counts, the writer's atomicity, and what damaged files say."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

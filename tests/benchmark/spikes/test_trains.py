@@ -1,7 +1,5 @@
 """Spike trains and spans between spikes against plain loops, and the memory that trains take."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

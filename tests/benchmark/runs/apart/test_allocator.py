@@ -1,7 +1,5 @@
 """Freed memory that stays with the process: counted by the pages that the system has to supply again."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A fit in a process that sees the training part alone: what it sees, what it makes, and how it ends."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """The part of a scene that one fit sees: what the method is given, and no more."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any
