@@ -40,9 +40,8 @@ def test_type_checkers_and_the_interpreter_see_the_same_names(room: str) -> None
 def test_the_front_has_the_names_of_everyday_work() -> None:
     package = importlib.import_module("spike4dgs")
     wanted = "open_scene open_stream load_model find_methods score_image make_image read_record write_predictions"
-    assert set(wanted.split()) <= set(package.__all__) and {*package.__all__, *ROOMS, "__version__"} <= set(
-        dir(package)
-    )
+    assert set(wanted.split()) <= set(package.__all__)
+    assert {*package.__all__, *ROOMS, "__version__"} <= set(dir(package))
     assert package.__version__ == version("spike4dgs") and (package.__doc__ or "").startswith("Spike4DGS")
     assert all(callable(getattr(package, name)) for name in package.__all__)
     assert [getattr(package, room).__name__ for room in ROOMS] == [f"spike4dgs.{room}" for room in ROOMS]

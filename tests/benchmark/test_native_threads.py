@@ -42,10 +42,6 @@ def test_every_room_says_so_before_numpy_and_torch_are_loaded(room: str) -> None
     assert run(f"import os, sys, spike4dgs.{room}; {SHOW}").stdout.strip() == f"{[kernels, 'PASSIVE', None]} False"
 
 
-def test_numpy_is_loaded_after_the_room_that_says_so() -> None:
-    assert run("import sys, spike4dgs.benchmark; print('numpy' in sys.modules)").stdout.strip() == "False"
-
-
 def test_libgomp_waits_as_it_was_told() -> None:
     shown = dict(re.findall(r"(\w+) = '(\w+)'", run("import spike4dgs.cli, torch", OMP_DISPLAY_ENV="verbose").stderr))
     if not shown:

@@ -40,12 +40,10 @@ def fail(error: Exception) -> Any:
 
 
 def test_on_a_machine_without_llvm_it_names_the_scalar_variant_and_what_mends_it(tmp_path: Path) -> None:
-    environment = os.environ | {"DRJIT_LIBLLVM_PATH": "/nonexistent", "XDG_CACHE_HOME": str(tmp_path)}
-    environment |= {"COLUMNS": "80", "SPIKE4DGS_DUST3R": ""}
-    environment.pop("SPIKE4DGS_MITSUBA_VARIANT", None)
-    done = subprocess.run(
-        [sys.executable, "-m", "spike4dgs.cli", "doctor"], capture_output=True, text=True, env=environment
-    )
+    env = os.environ | {"DRJIT_LIBLLVM_PATH": "/nonexistent", "XDG_CACHE_HOME": str(tmp_path)}
+    env |= {"COLUMNS": "80", "SPIKE4DGS_DUST3R": ""}
+    env.pop("SPIKE4DGS_MITSUBA_VARIANT", None)
+    done = subprocess.run([sys.executable, "-m", "spike4dgs.cli", "doctor"], capture_output=True, text=True, env=env)
     assert done.returncode == 0 and done.stderr == ""
     lines = done.stdout.splitlines()
     at = next(i for i, line in enumerate(lines) if line.startswith("mitsuba "))

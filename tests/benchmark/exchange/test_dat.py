@@ -39,10 +39,8 @@ def write_streams(folder: Path, names: Sequence[str], ticks: int = TICKS) -> dic
 def write_colmap(folder: Path, lens: str = "PINHOLE", more: Sequence[float] = (), names: Sequence[str] = ()) -> Path:
     model = pycolmap.Reconstruction()
     for i, c in enumerate(CAMERAS, start=1):
-        focal = [c.fx] if "RADIAL" in lens else [c.fx, c.fy]
-        camera = pycolmap.Camera(
-            camera_id=i, model=lens, width=c.width, height=c.height, params=[*focal, c.cx, c.cy, *more]
-        )
+        params = [*([c.fx] if "RADIAL" in lens else [c.fx, c.fy]), c.cx, c.cy, *more]
+        camera = pycolmap.Camera(camera_id=i, model=lens, width=c.width, height=c.height, params=params)
         model.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(image_id=i, camera_id=i, name=(names or [f"{c.id}.png" for c in CAMERAS])[i - 1])
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(c.R), c.t))

@@ -92,9 +92,8 @@ def write_depth(root: Path, ticks: tuple[int, ...] = (20,), hidden: NDArray | No
         for tick in ticks:
             shown = np.where(hidden, np.float32(1), depth) if hidden is not None and tick == ticks[0] else depth
             flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
-            write_geometry(
-                root / f"geometry/{name}/{tick:06d}.exr", shown, np.zeros(shown.shape, np.uint32), flow, 50.0 * tick
-            )
+            path, ids = root / f"geometry/{name}/{tick:06d}.exr", np.zeros(shown.shape, np.uint32)
+            write_geometry(path, shown, ids, flow, 50.0 * tick)
     write_manifest(root)
     return open_scene(root)
 

@@ -70,24 +70,17 @@ def test_zenodo_gets_a_draft_with_metadata_and_every_file(flat: Path, capsys) ->
     assert "DOI 10.5281/zenodo.7" in capsys.readouterr().out
 
 
-def test_zenodo_is_sent_only_what_it_lacks(flat: Path) -> None:
+def test_a_draft_is_sent_only_what_it_lacks_and_loses_what_an_earlier_try_left_there(flat: Path) -> None:
     with serve_uploads(Zenodo) as (address, host):
         assert main(["release", "publish", str(flat), "--to", f"zenodo+{address}"]) == 0
         assert host.draft is not None
         first = len(host.puts())
         host.draft["files"] = [f for f in host.draft["files"] if f["filename"] != "release.json"]
-        assert main(["release", "publish", str(flat), "--to", f"zenodo+{address}"]) == 0
-        assert host.puts()[first:] == ["/api/deposit/depositions/7", "/api/files/b-7/release.json"]
-        assert host.requests.count("POST /api/deposit/depositions") == 1
-
-
-def test_a_draft_loses_what_an_earlier_try_left_there(flat: Path) -> None:
-    with serve_uploads(Zenodo) as (address, host):
-        assert main(["release", "publish", str(flat), "--to", f"zenodo+{address}"]) == 0
-        assert host.draft is not None
         host.draft["files"].append({"id": "f-spike4dgs-1-00099.tar", "filename": "spike4dgs-1-00099.tar"})
         host.files["spike4dgs-1-00099.tar"] = b"of other scenes"
         assert main(["release", "publish", str(flat), "--to", f"zenodo+{address}"]) == 0
+        assert host.puts()[first:] == ["/api/deposit/depositions/7", "/api/files/b-7/release.json"]
+        assert host.requests.count("POST /api/deposit/depositions") == 1
     assert host.files == contents(flat)
 
 

@@ -38,11 +38,9 @@ HASTE = Patience(first_wait_s=0.001, longest_wait_s=0.002)
 WHOLE = Selection()
 
 
-def fetch(
-    address: str, out: Path, selection: Selection = WHOLE, workers: int = 4, patience: Patience = HASTE
-) -> Report:
+def fetch(address: str, out: Path, chosen: Selection = WHOLE, workers: int = 4, patience: Patience = HASTE) -> Report:
     source = Source(address, patience)
-    return download(source, open_release(source), selection, out, workers)
+    return download(source, open_release(source), chosen, out, workers)
 
 
 def tree(root: Path) -> dict[str, bytes]:

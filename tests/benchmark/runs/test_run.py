@@ -339,17 +339,14 @@ def test_exchanged_truth_is_not_scored_under_the_first_revision(small_scene: Pat
     assert method.fits == 0
 
 
-def test_scenes_and_methods_are_checked_before_any_work(small_scene: Path, tmp_path: Path) -> None:
+def test_scenes_methods_and_small_views_are_refused_before_any_fit(small_scene: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="distinct scenes"):
         run(tmp_path / "out", [small_scene, small_scene], CountMethod())
     with pytest.raises(UserError, match="expected a name of letters"):
         run(tmp_path / "out", [small_scene], CountMethod("a/b"))
-
-
-def test_views_that_no_metric_takes_are_refused_before_any_fit(tmp_path: Path) -> None:
-    scene, method = write_small_scene(tmp_path / "scene", width=8, height=8), CountMethod()
+    small = write_small_scene(tmp_path / "small", width=8, height=8)
     with pytest.raises(UserError, match="expected views of 11 pixels or more each way, found 8"):
-        run(tmp_path / "out", [scene], method)
+        run(tmp_path / "out", [small], CountMethod())
     assert not (tmp_path / "out/predictions").exists()
 
 

@@ -180,9 +180,7 @@ GAP = {"camera": "cam_01", "first_tick": 7, "ticks": 2, "reason": "usb overflow"
         (add_target(camera="cam_03", tick=20), "targets.json", "cam_03 at tick 20 twice"),
     ],
 )
-def test_a_scene_that_is_none_is_refused_in_one_line(
-    small_scene: Path, damage: Damage, where: str, message: str
-) -> None:
+def test_a_scene_that_is_none_is_refused_in_a_line(small_scene: Path, damage: Damage, where: str, message: str) -> None:
     damage(small_scene)
     with pytest.raises(UserError) as e:
         open_scene(small_scene)
@@ -203,9 +201,7 @@ def test_a_scene_that_is_none_is_refused_in_one_line(
         (remove("masks/cam_03/000020.png"), "masks/cam_03/000020.png", "no such file"),
     ],
 )
-def test_damaged_data_is_refused_by_whoever_reads_it(
-    small_scene: Path, damage: Damage, name: str, message: str
-) -> None:
+def test_damaged_data_is_refused_by_who_reads_it(small_scene: Path, damage: Damage, name: str, message: str) -> None:
     damage(small_scene)
     with pytest.raises(UserError) as e:
         read_everything(open_scene(small_scene))

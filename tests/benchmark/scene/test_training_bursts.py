@@ -51,16 +51,12 @@ def test_equal_bursts_give_equal_files(tmp_path: Path) -> None:
 
 def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
     path = write_toy_shard(tmp_path, 13)
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-100])
-    with pytest.raises(UserError, match="expected training bursts, found damaged data"):
-        open_bursts(path)
-    path.write_bytes(whole.replace(b"spike4dgs-bursts/1", b"spike4dgs-bursts/9"))
-    with pytest.raises(UserError, match="expected metadata spike4dgs-bursts/1, found spike4dgs-bursts/9"):
-        open_bursts(path)
-    path.write_bytes(whole.replace(b"values.0.1", b"values.0.7"))
-    with pytest.raises(UserError, match="expected training bursts, found damaged data"):
-        open_bursts(path).read(1)
+    whole, damaged = path.read_bytes(), "expected training bursts, found damaged data"
+    other = whole.replace(b"spike4dgs-bursts/1", b"spike4dgs-bursts/9"), "bursts/1, found spike4dgs-bursts/9"
+    for data, message in ((whole[:-100], damaged), other, (whole.replace(b"values.0.1", b"values.0.7"), damaged)):
+        path.write_bytes(data)
+        with pytest.raises(UserError, match=message):
+            open_bursts(path).read(1)
     with pytest.raises(UserError, match="expected a folder of training bursts, found no"):
         open_folder(tmp_path / "empty")
 
