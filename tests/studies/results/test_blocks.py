@@ -217,7 +217,7 @@ def test_rows_with_networks_are_compared_with_those_of_the_same_weights_alone() 
     def last(changed: str = "", **changes: str) -> str:
         each = [record(row, s, 30) for row in rows for s in SCENES]
         each = [r | {"code": codes.get(r["row"], r["code"])} for r in each]
-        return table_block(group, [r | changes if r["row"] == changed else r for r in each])[-1]
+        return blocks.table_block(group, [r | changes if r["row"] == changed else r for r in each])[-1]
 
     assert "code differs" not in last() and "code differs" in last("spk2img+4dgs", code="00000000000e")
     assert "code differs" in last("spike4dgs", commit="decade000000"), "neither digests nor commits are equal"
