@@ -47,53 +47,51 @@ def test_all_is_right(over: Made, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(shown.out.splitlines()) == shown.out.count("ok: ") == 2 + 2 * 3 + 2
 
 
-def test_public_files_alone_say_what_remains(over: Made, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
+def test_public_files_alone_say_what_remains(over: Made, said: Any) -> None:
+    said()
     assert checked(over, scenes=None, predictions=None) == 0
-    out = capsys.readouterr().out
+    out = said()
     assert out.count("ok: ") == 2 and out.count("not checked: ") == 8
     for seed in read_opening(over.public / OPENING_NAME).scenes:
         way = f"--profile tiny --variant 9003 --rendering paths --seed {seed.seed} --out"
         assert f"spike4dgs make-dataset {seed.world} {way}" in out
 
 
-def test_tars_alone_are_checked_and_nothing_else(
-    over: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tars_alone_are_checked(over: Made, tmp_path: Path, said: Any) -> None:
     for pack in (over.root / "scenes").glob("*.tar"):
         shutil.copy(pack, tmp_path)
-    capsys.readouterr()
+    said()
     assert checked(over, scenes=tmp_path) == 0
-    out = capsys.readouterr().out
+    out = said()
     assert out.count("is the tar committed to") == 4 and out.count("not checked: ") == 4
 
 
-def test_season_0_is_revealed_and_right(capsys: pytest.CaptureFixture[str]) -> None:
+def test_season_0_is_revealed_and_right(said: Any) -> None:
     seasons = Path(__file__).resolve().parents[3] / "leaderboard/seasons"
     assert check(0, seasons=seasons) == 0
-    out = capsys.readouterr().out
+    out = said()
     assert "ok: the seeds of 2 scenes" in out and "ok: 3 results" in out
 
 
-def test_before_the_reveal_nothing_secret_is_shown(once: Made, capsys: pytest.CaptureFixture[str]) -> None:
+def test_before_the_reveal_nothing_secret_is_shown(once: Made, said: Any) -> None:
     assert checked(once, scenes=None) == 0
-    out = capsys.readouterr().out
+    out = said()
     assert once.season.opening_sha256 in out and "ok: " not in out
     assert not [s for s in read_opening(once.secret / OPENING_NAME).scenes if s.seed in out]
 
 
 def test_a_scene_made_again_from_its_seed_is_the_committed_one(
-    over: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    over: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Any
 ) -> None:
     render_fakes(monkeypatch)
     for seed in read_opening(over.public / OPENING_NAME).scenes:
         settings = SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=seed.rendering)
         make_dataset([settings.job(seed.world)], tmp_path / "again")
     assert checked(over, scenes=tmp_path / "again") == 0
-    assert capsys.readouterr().out.count("is the scene committed to") == 2
+    assert said().count("is the scene committed to") == 2
     make_dataset([SceneSettings("tiny", int(seed.seed) ^ 1, 9003).job("car")], tmp_path / "wrong")
     assert checked(over, scenes=tmp_path / "wrong", predictions=None) == 2
-    assert "render other bytes" in capsys.readouterr().err
+    assert "render other bytes" in said()
 
 
 def changed(name: str, change: Callable[[Any], object]) -> Callable[[Made], None]:
@@ -105,13 +103,15 @@ def other_opening(over: Made) -> None:
     (over.public / OPENING_NAME).write_text(draw_opening(NUMBER, ("car", "turntable"), "tiny").text)
 
 
-def stream(over: Made) -> None:
-    flip_bit(over.root / "scenes" / SCENE / "spikes/cam_04.dat", 7)
+def stream(manifest: bool) -> Callable[[Made], None]:
+    """Change a spike, and perhaps the manifest with it."""
 
+    def forge(over: Made) -> None:
+        flip_bit(over.root / "scenes" / SCENE / "spikes/cam_04.dat", 7)
+        if manifest:
+            write_manifest(over.root / "scenes" / SCENE)
 
-def stream_and_manifest(over: Made) -> None:
-    stream(over)
-    write_manifest(over.root / "scenes" / SCENE)
+    return forge
 
 
 def truth_behind_an_honest_manifest(over: Made) -> None:
@@ -157,10 +157,6 @@ def table(over: Made) -> None:
     path.write_text(path.read_text().replace("counts", "others"))
 
 
-def missing_row(over: Made) -> None:
-    (over.public / "results/rough.json").unlink()
-
-
 def predictions(over: Made) -> None:
     folder = over.root / "runs/predictions/counts"
     shutil.rmtree(folder)
@@ -168,6 +164,8 @@ def predictions(over: Made) -> None:
 
 
 COUNTS = "results/counts.json"
+other_scenes = changed(COUNTS, lambda d: d["record"]["dataset"]["scenes"].update({SCENE: "0" * 64}))
+other_training = changed("season.json", lambda d: d["scenes"][0].update(training_revision="0" * 64))
 # What is changed, its folder, and what the check then says. It gets no more of the season than finds the change.
 FORGED: dict[str, tuple[Callable[[Made], None], str, str]] = {
     "seed": (changed(OPENING_NAME, lambda d: d["scenes"][0].update(seed="1")), "seasons", "as committed"),
@@ -175,38 +173,25 @@ FORGED: dict[str, tuple[Callable[[Made], None], str, str]] = {
     "other opening": (other_opening, "seasons", "as committed"),
     "world": (changed("season.json", lambda d: d["scenes"][0].update(world="van")), "seasons", "as in season.json"),
     "code": (changed("season.json", lambda d: d["harness"].update(commit="0" * 40)), "seasons", "as in season.json"),
-    "stream": (stream, "scenes", "cam_04.dat: expected sha256"),
-    "stream and manifest": (stream_and_manifest, "scenes", "expected revision"),
+    "stream": (stream(manifest=False), "scenes", "cam_04.dat: expected sha256"),
+    "stream and manifest": (stream(manifest=True), "scenes", "expected revision"),
     "truth": (truth_behind_an_honest_manifest, "scenes", "the manifest claims another content"),
     "source's seed": (source_seed, "scenes", "as revealed"),
-    "training part": (
-        changed("season.json", lambda d: d["scenes"][0].update(training_revision="0" * 64)),
-        "scenes",
-        "expected a training part of revision 0000",
-    ),
+    "training part": (other_training, "scenes", "expected a training part of revision 0000"),
     "tar": (longer(f"{SCENE}.tar"), "scenes", f"{SCENE}.tar: expected sha256"),
     "training tar": (longer(f"{SCENE}-training.tar"), "scenes", f"{SCENE}-training.tar: expected sha256"),
     "value": (value, "runs", "as computed from the files"),
     "mean": (changed(COUNTS, lambda d: d["record"]["mean"].update(psnr=60.0)), "seasons", "the mean of its parts"),
-    "other scenes": (
-        changed(COUNTS, lambda d: d["record"]["dataset"]["scenes"].update({SCENE: "0" * 64})),
-        "seasons",
-        "expected scores of the committed",
-    ),
+    "other scenes": (other_scenes, "seasons", "expected scores of the committed"),
     "table": (table, "seasons", "expected the table of the results"),
-    "missing row": (missing_row, "seasons", "expected the table of the results"),
+    "missing row": (lambda over: (over.public / "results/rough.json").unlink(), "seasons", "expected the table of"),
     "predictions": (predictions, "runs", "expected predictions"),
 }
 
 
 @pytest.mark.parametrize(("forge", "folder", "message"), FORGED.values(), ids=FORGED)
 def test_every_forged_part_is_caught(
-    forge: Callable[[Made], None],
-    folder: str,
-    message: str,
-    over: Made,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    forge: Any, folder: str, message: str, over: Made, tmp_path: Path, said: Any
 ) -> None:
     for name in ("seasons", "scenes", "runs"):  # a forgery changes its folder and the public files alone
         if name in ("seasons", folder):
@@ -214,7 +199,7 @@ def test_every_forged_part_is_caught(
         else:
             (tmp_path / name).symlink_to(over.root / name)
     forge(Made(tmp_path))
-    capsys.readouterr()
+    said()
     needless: dict[str, Any] = {"seasons": {"scenes": None, "predictions": None}, "scenes": {"predictions": None}}
     assert checked(Made(tmp_path), **needless.get(folder, {})) == 2
-    assert message in capsys.readouterr().err
+    assert message in said()

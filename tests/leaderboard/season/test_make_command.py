@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from changes import files_in
+from changes import edit_json, files_in
 from fake_renderer import render_fakes
 from made_season import NUMBER, WORLDS, Made
 
@@ -34,10 +33,8 @@ def test_the_commitments_are_those_of_what_was_made(once: Made) -> None:
         whole = open_scene(scene_folder(once.secret, scene.id))
         assert str(whole.meta["source"]["seed"]) == seed.seed
         assert seed.rendering == "paths" and "soft" not in whole.meta["source"]["sampling"]
-        assert (scene.revision, scene.pack_sha256) == (
-            whole.revision,
-            sha256_file(pack_file(once.secret, scene.id, training=False)),
-        )
+        assert scene.revision == whole.revision
+        assert scene.pack_sha256 == sha256_file(pack_file(once.secret, scene.id, training=False))
         part = open_scene(training_folder(once.secret, scene.id))
         assert scene.training_revision == part.revision != whole.revision
         assert scene.training_pack_sha256 == sha256_file(pack_file(once.secret, scene.id, training=True))
@@ -82,9 +79,9 @@ def test_two_processes_do_not_make_one_season(once: Made) -> None:
         command(once)
 
 
-def test_commitments_never_change(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commitments_never_change(made: Made, said: Any) -> None:
     before = files_in(made.root)
-    assert command(made) == 0 and "complete, kept" in capsys.readouterr().out
+    assert command(made) == 0 and "complete, kept" in said()
     assert files_in(made.root) == before
     with pytest.raises(UserError, match=r"expected the commitment .* choose another number or --secret"):
         command(made, secret=made.root / "another")
@@ -123,9 +120,6 @@ def test_a_typo_leaves_no_secret(options: dict[str, Any], message: str, tmp_path
 
 
 def test_another_version_of_the_code_does_not_finish_a_season(made: Made) -> None:
-    path = made.secret / OPENING_NAME
-    data = json.loads(path.read_text())
-    data["harness"]["commit"] = "0" * 40
-    path.write_text(json.dumps(data, indent=2, sort_keys=True) + "\n")
+    edit_json(made.secret / OPENING_NAME, lambda opening: opening["harness"].update(commit="0" * 40))
     with pytest.raises(UserError, match="with the same version of the code"):
         command(made)

@@ -53,24 +53,16 @@ def test_a_rendering_by_whole_paths_is_not_named_as_in_season_0(tmp_path: Path) 
     assert read_opening(tmp_path / OPENING_NAME, paths.sha256) == paths
 
 
-@given(position=st.integers(0, len(TEXT) - 1), byte=st.integers(0, 255))
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_changed_byte_is_refused(tmp_path: Path, position: int, byte: int) -> None:
-    changed = TEXT[:position] + bytes([byte]) + TEXT[position + 1 :]
+@given(st.integers(0, len(TEXT)), st.sampled_from([0, 1, 1, 1]), st.binary(min_size=1, max_size=3))
+@settings(max_examples=600, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_changed_or_added_byte_is_refused(tmp_path: Path, position: int, gone: int, more: bytes) -> None:
+    changed = TEXT[:position] + more + TEXT[position + gone :]
     (tmp_path / OPENING_NAME).write_bytes(changed)
     if changed == TEXT:
         assert read_opening(tmp_path / OPENING_NAME, OPENING.sha256) == OPENING
     else:
         with pytest.raises(UserError):
             read_opening(tmp_path / OPENING_NAME, OPENING.sha256)
-
-
-@given(st.integers(0, len(TEXT)), st.binary(min_size=1, max_size=3))
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_added_byte_is_refused(tmp_path: Path, position: int, more: bytes) -> None:
-    (tmp_path / OPENING_NAME).write_bytes(TEXT[:position] + more + TEXT[position:])
-    with pytest.raises(UserError):
-        read_opening(tmp_path / OPENING_NAME, OPENING.sha256)
 
 
 @pytest.mark.parametrize(
@@ -91,11 +83,7 @@ def test_a_text_with_two_meanings_cannot_be_committed_to(other: str, tmp_path: P
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [
-        ({"salt": "ab" * 31}, "at salt"),
-        ({"scenes": ()}, "at scenes"),
-        ({"season": -1}, "at season"),
-    ],
+    [({"salt": "ab" * 31}, "at salt"), ({"scenes": ()}, "at scenes"), ({"season": -1}, "at season")],
 )
 def test_a_weak_opening_is_refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
     weak = Opening(**{**vars(OPENING), **change})  # type: ignore[arg-type]

@@ -1,22 +1,21 @@
 from __future__ import annotations
 
-import json
 import shutil
 from datetime import UTC, datetime, timedelta
 
 import pytest
+from changes import edit_json
 from made_season import NUMBER, Made
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import sha256_file, write_json
+from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.cli.season import publish, reveal
 from spike4dgs.leaderboard.season.season_file import OPENING_NAME, draw_opening, write_secret
 
 
 def closing(made: Made, days: int) -> None:
-    path = made.public / "season.json"
     day = (datetime.now(UTC) + timedelta(days=days)).strftime("%Y-%m-%d")
-    write_json(path, json.loads(path.read_text()) | {"closes": day})
+    edit_json(made.public / "season.json", lambda season: season.update(closes=day))
 
 
 def test_the_revealed_file_is_what_was_committed_to(scored: Made) -> None:
@@ -68,7 +67,6 @@ def test_a_pack_that_was_not_committed_to_is_not_published(made: Made) -> None:
 
 
 def test_hidden_streams_are_not_published(made: Made) -> None:
-    path = made.public / "season.json"
-    write_json(path, json.loads(path.read_text()) | {"streams": "hidden"})
+    edit_json(made.public / "season.json", lambda season: season.update(streams="hidden"))
     with pytest.raises(UserError, match="expected published streams, found hidden ones"):
         publish(NUMBER, secret=made.secret, seasons=made.seasons, out=made.root / "out")

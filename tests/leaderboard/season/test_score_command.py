@@ -67,22 +67,22 @@ def test_a_name_that_is_written_in_another_way_is_the_same(scored_once: Made, na
         write_result(scored_once.seasons, NUMBER, replace(result, record=record))
 
 
-def test_a_name_is_scored_once(scored: Made, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_is_scored_once(scored: Made, said: Any) -> None:
     before = files_in(scored.seasons)
     assert scored.score("counts") == 0 and files_in(scored.seasons) == before
-    capsys.readouterr()
+    said()
     tuned = CountMethod("counts", steps=2)
     scenes = open_committed(scored.secret, scored.season, training=True)
     predict_all(scenes, [tuned], Settings(scored.root / "runs", budget=Budget()))
     assert scored.score("counts") == 1 and files_in(scored.seasons) == before
-    assert "a name is scored once in a season: submit under another one" in capsys.readouterr().err
+    assert "a name is scored once in a season: submit under another one" in said()
 
 
-def test_one_participants_mistake_does_not_stop_another(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_participants_mistake_does_not_stop_another(made: Made, said: Any) -> None:
     folder = made.root / "runs/predictions/counts/car-9003-tiny"
     edit_json(folder / "prediction.json", lambda p: p.update(scene_revision="0" * 64))
     assert made.score("counts", "rough") == 1
-    assert "expected predictions for scene revision" in capsys.readouterr().err
+    assert "expected predictions for scene revision" in said()
     assert [r.name for r in read_results(made.seasons, made.season)] == ["rough"]
 
 
@@ -143,15 +143,12 @@ def test_nothing_is_scored_after_the_reveal(scored: Made) -> None:
         scored.score("counts")
 
 
-def test_hidden_streams_take_methods_only(made: Made) -> None:
+def test_nothing_to_score_is_an_error_and_hidden_streams_take_methods_only(made: Made) -> None:
+    with pytest.raises(UserError, match="expected --predictions or --methods, found neither"):
+        made.score()
     edit_json(made.public / "season.json", lambda s: s.update(streams="hidden"))
     with pytest.raises(UserError, match="expected a season with published streams"):
         made.score("counts")
-
-
-def test_nothing_to_score_is_an_error(once: Made) -> None:
-    with pytest.raises(UserError, match="expected --predictions or --methods, found neither"):
-        once.score()
 
 
 @pytest.mark.parametrize("folder", [scene_folder, training_folder])
