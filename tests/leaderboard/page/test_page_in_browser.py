@@ -62,11 +62,8 @@ def hostile_board() -> Board:
 
 def sensors_board() -> Board:
     """Two methods on an ideal and a noisy scene, as the records say."""
-    values = {"clean": (40.0, 20.0), "other": (30.0, 25.0)}
-    made = [
-        row(name, {scene: cell({"psnr": np.full(3, v)}) for scene, v in zip(("i", "n"), of, strict=True)})
-        for name, of in values.items()
-    ]
+    values = (("clean", (40.0, 20.0)), ("other", (30.0, 25.0)))
+    made = [row(name, {s: cell({"psnr": np.full(3, v)}) for s, v in zip("in", of, strict=True)}) for name, of in values]
     for one in made:
         one.first["sensors"] = {"i": "ideal", "n": "noisy"}
     return board("sensors", made)
@@ -157,16 +154,25 @@ def settle(page: Page) -> None:
     wait_for("the page", lambda: page.value("document.body.dataset.whole === location.hash"))
 
 
+def click(page: Page, element: str) -> None:
+    page.value(f"{element}.click()")
+    settle(page)
+
+
+def text_of(page: Page, name: str) -> str:
+    """The text of the element with that id."""
+    return page.value(f"document.getElementById({name!r}).textContent")
+
+
 def names(page: Page) -> list[str]:
     return page.value("[...document.querySelectorAll('#table tbody tr')].map(r => r.dataset.row)")
 
 
 def column(page: Page, title: str) -> list[str]:
     """The cells of the column whose header starts so."""
-    cells = f"[...document.querySelectorAll('#table thead th')].findIndex(h => h.innerText.startsWith({title!r}))"
-    return page.value(
-        f"[...document.querySelectorAll('#table tbody tr')].map(r => r.cells[{cells}].textContent.trim())"
-    )
+    index = f"[...document.querySelectorAll('#table thead th')].findIndex(h => h.innerText.startsWith({title!r}))"
+    rows = "[...document.querySelectorAll('#table tbody tr')]"
+    return page.value(f"{rows}.map(r => r.cells[{index}].textContent.trim())")
 
 
 def choose(page: Page, name: str, value: str) -> None:
@@ -199,12 +205,11 @@ def test_filters_count_what_they_hide_and_live_in_the_address(page: Page, commit
     go(page, "t=ideal")
     choose(page, "motion", "hexplane")
     assert page.value("location.hash") == "#t=ideal&motion=hexplane"
-    count = page.value("document.getElementById('count').textContent")
+    count = text_of(page, "count")
     assert f"{shown} rows; {hidden} rows hidden by filters" in count and shown > 3
     choose(page, "maxfit", "100")
     assert "tfi+4dgs" not in names(page) and "spike4dgs" in names(page)
-    page.value("document.querySelector('#count button').click()")
-    settle(page)
+    click(page, "document.querySelector('#count button')")
     assert page.value("location.hash") == "#t=ideal" and len(names(page)) == shown + hidden
 
 
@@ -224,29 +229,25 @@ def test_the_address_restores_everything(page: Page) -> None:
 def test_headers_sort_and_say_so(page: Page) -> None:
     go(page, "t=ideal")
     header = "[...document.querySelectorAll('#table thead th')].find(h => h.innerText.startsWith('FLIP'))"
-    page.value(f"{header}.querySelector('button').click()")
-    settle(page)
+    click(page, f"{header}.querySelector('button')")
     assert page.value(f"{header}.getAttribute('aria-sort')") == "ascending", "lower is better comes first"
     flip = [float(v) for v in column(page, "FLIP")]
     assert flip == sorted(flip)
-    page.value(f"{header}.querySelector('button').click()")
-    settle(page)
+    click(page, f"{header}.querySelector('button')")
     assert [float(v) for v in column(page, "FLIP")] == sorted(flip, reverse=True)
 
 
 def test_a_row_that_lacks_a_scene_has_no_mean_until_the_scene_is_left_out(page: Page) -> None:
     go(page, "t=hostile")
     assert column(page, "PSNR, dB")[names(page).index("constructor")] == "–"
-    assert "incomplete: s failed" in page.value("document.getElementById('table').textContent")
+    assert "incomplete: s failed" in text_of(page, "table")
 
 
 def test_a_label_says_what_kept_the_second_fit_apart_and_what_that_does_not_prevent(page: Page) -> None:
     go(page, "t=labels")
-    assert dict(zip(names(page), column(page, "Verified"), strict=True)) == {
-        "claims": "re-scored",
-        "fitted": "re-fitted (process)",
-    }
-    text = page.value("document.getElementById('below').textContent")
+    labels = dict(zip(names(page), column(page, "Verified"), strict=True))
+    assert labels == {"claims": "re-scored", "fitted": "re-fitted (process)"}
+    text = text_of(page, "below")
     assert "only a container (submit --refit --container) keeps a method from files" in text
 
 
@@ -277,13 +278,12 @@ def test_an_entry_without_a_rank_is_below_not_the_best_and_not_on_the_front(page
 
 def better_of(page: Page, name: str, scenes: list[int]) -> Any:
     """What the page's own bootstrap says of a board."""
-    found = page.value(
+    code = (
         f"(() => {{ const {{page}} = Spike4DGS.app.current(); const b = page.boards.findIndex(b => b.id === {name!r});"
-        f"const s = Spike4DGS.ready(`scores-${{b}}-psnr`);"
-        f"const values = Spike4DGS.intervals.nested(s, {scenes});"
+        f"const values = Spike4DGS.intervals.nested(Spike4DGS.ready(`scores-${{b}}-psnr`), {scenes});"
         "return Spike4DGS.intervals.compare(values, true, page.bootstrap).better })()"
     )
-    return np.array(found)
+    return np.array(page.value(code))
 
 
 @pytest.mark.parametrize("name", ["ideal", "quick-start", "seeds"])
@@ -333,12 +333,11 @@ def test_slider_scrubber_and_crop(page: Page, data: Path) -> None:
     first = image(page, "pane-truth")
     page.value("document.querySelector('[name=k]').focus()")
     page.press("End")
-    wait_for("the last image", lambda: "image 3 of 3" in page.value("document.getElementById('at').textContent"))
+    wait_for("the last image", lambda: "image 3 of 3" in text_of(page, "at"))
     assert np.abs(image(page, "pane-truth") - first).mean() > 1, "the pattern moves"
-    assert "3.00 ms" in page.value("document.getElementById('scene-scores').textContent")
+    assert "3.00 ms" in text_of(page, "scene-scores")
     assert "k=2" in page.value("location.hash")
-    page.value("document.querySelector('[name=crop]').click()")
-    settle(page)
+    click(page, "document.querySelector('[name=crop]')")
     assert "crop=1" in page.value("location.hash")
     shape = image(page, "pane-truth").shape
     assert shape[0] / shape[1] == pytest.approx(24 / 24, abs=0.05), "a crop of 24x24 of 40x24 pixels"
@@ -359,9 +358,8 @@ def test_error_maps_are_coloured_on_the_scale_that_is_said(page: Page, data: Pat
         expected = cv2.cvtColor(error_image(rendered, truth, scale), cv2.COLOR_RGB2GRAY)
         large = cv2.resize(expected, shown.shape[::-1], interpolation=cv2.INTER_NEAREST)
         same = (slice(None), slice(None, -8))  # without the slider's bar at the right
-        assert (
-            np.corrcoef(shown[same].ravel(), large[same].ravel())[0, 1] > 0.9
-        )  # the browser rounds the edges of enlarged pixels otherwise
+        # the browser rounds the edges of enlarged pixels otherwise
+        assert np.corrcoef(shown[same].ravel(), large[same].ravel())[0, 1] > 0.9
         assert np.median(np.abs(shown[same] - large[same])) < 4
         seen.append(shown.mean())
     assert seen[0] < seen[1] < seen[2], "a smaller scale is brighter"
@@ -392,7 +390,7 @@ def test_entries_with_sheets_show_an_image_without_runs(page: Page, data: Path, 
             small = cv2.resize(seen, of.shape[::-1], interpolation=cv2.INTER_AREA)[:, :-1]  # without the slider's bar
             assert np.abs(small - of[:, :-1]).mean() < (25 if pane == "errors" else 4)
             assert np.corrcoef(small.ravel(), of[:, :-1].ravel())[0, 1] > 0.8
-    text = page.value("document.getElementById('scenes').textContent")
+    text = text_of(page, "scenes")
     assert "cam_03/000040" in text and "as it comes with the entries" in text and "--runs" in text
     assert page.value("document.querySelectorAll('[name=split]').length") == 1
     assert page.value("document.querySelectorAll('[name=k]').length") == 0, "one image has no time to choose"
@@ -406,7 +404,7 @@ def test_entries_with_sheets_show_an_image_without_runs(page: Page, data: Path, 
 
 def test_a_board_without_images_says_how_to_get_them(page: Page) -> None:
     go(page, "t=sensors&scene=i&a=clean&b=other")
-    text = page.value("document.getElementById('scenes').textContent")
+    text = text_of(page, "scenes")
     assert "No images here" in text and "--runs" in text and "clean" in text
     assert page.value("document.querySelectorAll('.curves svg').length") == 1
 
@@ -419,9 +417,7 @@ def test_plots_colour_families_and_gray_out_what_is_hidden(page: Page, committed
     assert page.value(gray) == count_of(committed, images="tfp")[1]
     (old,) = (name for of, name in zip(committed, titles(committed), strict=True) if of.name == "bicycle-0-small+4")
     go(page, f"t={quote(old)}&m=psnr_dynamic")
-    assert "18.07" in page.value("document.getElementById('plots').textContent"), (
-        "the floor is named, not left out silently"
-    )
+    assert "18.07" in text_of(page, "plots"), "the floor is named, not left out silently"
 
 
 def download(page: Page, folder: Path, kind: str) -> str:
@@ -449,10 +445,9 @@ def test_downloads_are_what_is_shown(page: Page, tmp_path: Path, committed: list
 def test_nothing_that_an_entry_holds_runs(page: Page, tmp_path: Path) -> None:
     go(page, "t=hostile")
     assert HOSTILE in names(page)
-    page.value("document.querySelector('#table button.link').click()")
-    settle(page)
+    click(page, "document.querySelector('#table button.link')")
     wait_for("details", lambda: page.value("document.getElementById('details').open"))
-    text = page.value("document.getElementById('details').textContent")
+    text = text_of(page, "details")
     assert text.count(HOSTILE) >= 4 and "__proto__" in text
     page.press("Escape")
     wait_for("closed", lambda: not page.value("document.getElementById('details').open"))
@@ -466,7 +461,7 @@ def test_nothing_that_an_entry_holds_runs(page: Page, tmp_path: Path) -> None:
 def test_details_have_command_hashes_and_commit(page: Page) -> None:
     go(page, "t=ideal&row=tfp%2B4dgs")
     wait_for("details", lambda: page.value("document.getElementById('details').open"))
-    text = page.value("document.getElementById('details').textContent")
+    text = text_of(page, "details")
     entry = json.loads(next(COMMITTED.glob("entries/2-ideal@*/tfp+4dgs.json")).read_text())["record"]
     assert entry["command"] in text and entry["harness"]["commit"] in text and entry["environment"]["cpu"] in text
     assert all(cell["predictions_sha256"] in text for cell in entry["scenes"].values())
@@ -485,13 +480,12 @@ def test_questions_are_answered_in_one_click(page: Page) -> None:
     for text, expected in (("on a noisy sensor", quick), ("not calibrated", uncalibrated)):
         go(page, "t=quick-start")
         link = f"[...document.querySelectorAll('#questions a')].find(a => a.textContent.includes('{text}'))"
-        page.value(f"{link}.click()")
-        settle(page)
+        click(page, link)
         assert names(page) == expected and expected
         hidden = f"{len(record) - len(expected)} rows hidden"
-        assert hidden in page.value("document.getElementById('count').textContent")
+        assert hidden in text_of(page, "count")
         assert page.value("document.querySelector('[name=sensor]').value") == "noisy"
-        assert "sensor is noisy" in page.value("document.getElementById('about').textContent")
+        assert "sensor is noisy" in text_of(page, "about")
 
 
 def test_the_sensor_filters_scenes_and_hides_all_rows_where_no_scene_has_it(page: Page, committed: list[Board]) -> None:
@@ -504,17 +498,15 @@ def test_the_sensor_filters_scenes_and_hides_all_rows_where_no_scene_has_it(page
     choose(page, "sensor", "")
     assert column(page, "PSNR, dB") == ["30.00", "27.50"]
     go(page, "t=ideal&sensor=recorded")
-    assert names(page) == [] and f"{every} rows hidden" in page.value("document.getElementById('count').textContent")
-    page.value("document.querySelector('#count button').click()")
-    settle(page)
+    assert names(page) == [] and f"{every} rows hidden" in text_of(page, "count")
+    click(page, "document.querySelector('#count button')")
     assert len(names(page)) == every
 
 
 def as_html(markdown: str) -> str:
     """A page of documentation with its links, as far as a browser needs it."""
-    linked = re.sub(
-        r"\[([^\]]+)\]\(([^)]+?)\)", lambda m: f'<a href="{m[2]}">{" ".join(m[1].split())}</a>', markdown
-    )  # a text may go on in the next line
+    link = r"\[([^\]]+)\]\(([^)]+?)\)"  # its text may go on in the next line
+    linked = re.sub(link, lambda m: f'<a href="{m[2]}">{" ".join(m[1].split())}</a>', markdown)
     pages = re.sub(r'(href="(?!http)[^"#]*)\.md', r"\1.html", linked)
     return f"<meta charset=utf-8><body>{pages}"
 
@@ -552,12 +544,10 @@ def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
         go(page, state)
         assert page.value(unnamed) == []
     page.value("document.getElementById('skip').focus()")
-    reached = set()
+    reached, active = set(), "document.activeElement"
     for _ in range(12):
         page.press("Tab")
-        reached.add(
-            page.value("document.activeElement.closest('nav, form, main, body').id || document.activeElement.id")
-        )
+        reached.add(page.value(f"{active}.closest('nav, form, main, body').id || {active}.id"))
     assert {"questions", "tabs"} <= reached
     for width in (390, 800, 1400):
         page.call("Emulation.setDeviceMetricsOverride", width=width, height=800, deviceScaleFactor=1, mobile=False)
@@ -578,10 +568,9 @@ def test_a_thousand_rows_of_45_scenes_filter_at_once(
         median, worst = np.median(measured), max(measured)
         print(f"\n{ROWS} rows x {SCENES} scenes, {len(measured)} filters: ", end="")
         print(f"median {median:.0f} ms, worst {worst:.0f} ms to the new table")
-    count = page.value("document.getElementById('count').textContent")
-    assert count.startswith("167 rows, the first 50 drawn; 833 rows hidden"), (
-        "a third of the rows, every second of them"
-    )
+    count = text_of(page, "count")
+    # a third of the rows, every second of them
+    assert count.startswith("167 rows, the first 50 drawn; 833 rows hidden")
     assert min(measured) < FILTER_MS, "the least disturbed one: other programs only add to it"
     assert median < 5 * FILTER_MS, "on a machine whose processors all do something else"
 
