@@ -1,4 +1,7 @@
-"""Each deviation from ideal cameras and light against a closed form or a published figure, through `make-dataset`."""
+"""Each deviation from ideal cameras and light against a closed form or a published figure, through `make-dataset`.
+
+Also the names and settings of the scenes to make.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +35,13 @@ def plain(stage, steps, total):
     yield from steps
 
 
+@pytest.fixture
+def made(tmp_path, monkeypatch):
+    """Make a scene with some deviations; return its folder."""
+    render_fakes(monkeypatch)
+    return lambda of: Maker(of, tmp_path, plain).make()
+
+
 @pytest.fixture(scope="module")
 def ideal(tmp_path_factory) -> Path:
     """The scene with every deviation off; no test may change it."""
@@ -47,6 +57,22 @@ def test_what_is_off_is_neither_in_the_id_nor_in_the_settings():
     assert job(speed=1.5, flicker=0.1).id == "car-0-tiny-flicker-speed3of2"
     assert replace(JOB, physics=CAMERAS["realistic"]).id == "car-0-tiny-realistic"
     assert PhysicsOptions().physics() == CAMERAS["ideal"] == Physics()
+    curved = job(lens=(-0.1, 0.0, 0.0, 0.0, 0.0))
+    assert curved.id == "car-0-tiny-lens"
+    assert curved.settings == JOB.settings | {"physics": {"lens": [-0.1, 0.0, 0.0, 0.0, 0.0]}}
+
+
+def test_names_contain_a_length_that_is_not_the_profiles():
+    assert Job("car", 2, 0, "paper", PROFILES["paper"], 0.5).id == "car-2-paper-500ms"
+    assert Job("car", 2, 0, "paper", PROFILES["paper"], 0.1).id == "car-2-paper"
+    assert list(Job("car", 0, 0, "small", PROFILES["small"], 0.02).target_ticks) == list(range(20, 400, 20))
+
+
+def test_seeds_beyond_64_bits_are_text_in_the_settings():
+    """Readers of JSON other than Python's keep 64 bits of an integer at most."""
+    seeds = (0, 2**63 - 1, 2**63, 2**128 - 1)
+    found = [replace(JOB, seed=seed).settings["seed"] for seed in seeds]
+    assert found == [0, 2**63 - 1, str(2**63), str(2**128 - 1)]
 
 
 def test_settings_are_read_back():
@@ -133,12 +159,11 @@ def test_given_poses_move_pixels_by_what_their_noise_says():
         assert np.allclose(other.R @ other.R.T, np.eye(3))
 
 
-def test_a_scene_of_moved_poses_keeps_the_true_ones_where_no_method_looks(tmp_path, monkeypatch):
-    render_fakes(monkeypatch)
-    made = job(pose_noise_deg=0.05, pose_noise_m=0.002)
-    scene = open_scene(Maker(made, tmp_path, plain).make())
+def test_a_scene_of_moved_poses_keeps_the_true_ones_where_no_method_looks(made):
+    moved = job(pose_noise_deg=0.05, pose_noise_m=0.002)
+    scene = open_scene(made(moved))
     truth = json.loads((scene.root / "truth/cameras.json").read_text())
-    for camera in cameras_of(made):
+    for camera in cameras_of(moved):
         known = from_nerfstudio(camera.id, truth[camera.id])
         assert np.allclose(known.R, camera.R) and np.allclose(known.t, camera.t)
         given = scene.cameras[camera.id]
@@ -154,9 +179,8 @@ def test_dark_current_doubles_every_8_kelvin_between_silicons_two_laws():
     assert Physics(warming_k=8.0).dark_factor == 2 and Physics(warming_k=-16.0).dark_factor == 0.25
 
 
-def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibration(ideal, tmp_path, monkeypatch):
-    render_fakes(monkeypatch)
-    folders = [ideal, Maker(job(warming_k=8.0), tmp_path, plain).make()]
+def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibration(ideal, made):
+    folders = [ideal, made(job(warming_k=8.0))]
     for name in ("calibration/dark/cam_00.dat", "calibration/flat/cam_00.dat"):
         assert len({(f / name).read_bytes() for f in folders}) == 1
     counts = [open_stream(f / "spikes/cam_00.dat", 64, 40, 2e4, rows_bottom_up=True).counts(0, 80) for f in folders]
@@ -164,9 +188,8 @@ def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibrat
     assert added == pytest.approx(sensor_of(JOB, cameras_of(JOB)[0]).dark.mean(), rel=0.1)
 
 
-def test_a_stopped_down_lens_scales_light_and_neither_the_dark_rate_nor_the_truth(ideal, tmp_path, monkeypatch):
-    render_fakes(monkeypatch)
-    full, dim = (open_scene(folder) for folder in (ideal, Maker(job(light=0.25), tmp_path, plain).make()))
+def test_a_stopped_down_lens_scales_light_and_neither_the_dark_rate_nor_the_truth(ideal, made):
+    full, dim = (open_scene(folder) for folder in (ideal, made(job(light=0.25))))
     assert dim.radiance_gain == full.radiance_gain / 4
     for name in (f"images/{full.targets[0].name}.exr", "calibration/dark/cam_00.dat"):
         assert (full.root / name).read_bytes() == (dim.root / name).read_bytes()
@@ -187,24 +210,22 @@ def test_twice_the_speed_is_the_same_motion_in_half_the_time(name):
     assert fast.duration_s == job.seconds and fast.object_names == slow.object_names
 
 
-def test_an_array_that_moves_is_recorded_beside_the_scene_and_changes_no_camera(ideal, tmp_path, monkeypatch):
-    render_fakes(monkeypatch)
-    made = job(array_motion=2.0, array_rotation=30.0)
-    scene = Maker(made, tmp_path, plain).make()
+def test_an_array_that_moves_is_recorded_beside_the_scene_and_changes_no_camera(ideal, made):
+    moving = job(array_motion=2.0, array_rotation=30.0)
+    scene = made(moving)
     assert scene.name == "car-0-tiny-arraymotion-arrayrotation"
-    assert recorded_job(json.loads((scene / "scene.json").read_text())["source"]) == made
+    assert recorded_job(json.loads((scene / "scene.json").read_text())["source"]) == moving
     assert (scene / "transforms_all.json").read_bytes() == (ideal / "transforms_all.json").read_bytes()
     told = json.loads((scene / "truth/array_path.json").read_text())
     assert told["ticks"] == [0, 20, 40, 60, 80] and not (ideal / "truth/array_path.json").exists()
     first, last = (np.array(told["array_to_world"][k]) for k in (0, -1))
     np.testing.assert_array_equal(first, np.eye(4))
-    middle = np.array(world_of(made).rig.center)
+    middle = np.array(world_of(moving).rig.center)
     assert np.linalg.norm(last[:3, :3] @ middle + last[:3, 3] - middle) == pytest.approx(2.0 * 0.004, rel=1e-3)
 
 
-def test_lost_ticks_are_zeros_that_the_scene_lists(ideal, tmp_path, monkeypatch):
-    render_fakes(monkeypatch)
-    holed = Maker(job(lost_ticks=0.2), tmp_path, plain).make()
+def test_lost_ticks_are_zeros_that_the_scene_lists(ideal, made):
+    holed = made(job(lost_ticks=0.2))
     with pytest.raises(UserError, match="--allow-gaps"):
         open_scene(holed)
     whole, holed = open_scene(ideal), open_scene(holed, allow_gaps=True)
@@ -217,11 +238,10 @@ def test_lost_ticks_are_zeros_that_the_scene_lists(ideal, tmp_path, monkeypatch)
     assert np.mean(lost) == pytest.approx(0.2, abs=0.08) and not np.array_equal(lost[0], lost[1])
 
 
-def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(ideal, tmp_path, monkeypatch):
-    render_fakes(monkeypatch)
-    made = job(flicker=0.5, flicker_hz=250)
-    steady, lit = (open_scene(folder) for folder in (ideal, Maker(made, tmp_path, plain).make()))
-    light = made.flicker
+def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(ideal, made):
+    flickering = job(flicker=0.5, flicker_hz=250)
+    steady, lit = (open_scene(folder) for folder in (ideal, made(flickering)))
+    light = flickering.flicker
     for target in steady.targets:
         ratio = lit.ground_truth(target) / steady.ground_truth(target)
         assert ratio == pytest.approx(light.at(target.tick), rel=2e-3)
@@ -232,21 +252,19 @@ def test_flicker_is_in_the_streams_and_in_the_truth_at_its_instant(ideal, tmp_pa
     assert (counts[1] - dark) / (counts[0] - dark) == pytest.approx(expected, rel=0.01)
 
 
-def test_a_scenes_description_states_what_the_sensor_does(ideal, tmp_path, monkeypatch):
-    render_fakes(monkeypatch)
-    made = job(dead_ticks=1, read_noise=0.006, reset_noise=0.0009, clock_ripple=0.008)
-    scene = open_scene(Maker(made, tmp_path, plain).make())
+def test_a_scenes_description_states_what_the_sensor_does(ideal, made):
+    real = job(dead_ticks=1, read_noise=0.006, reset_noise=0.0009, clock_ripple=0.008)
+    scene = open_scene(made(real))
     sensor, training = scene.meta["sensor"], scene.training
     assert (sensor["dead_ticks"], sensor["read_noise"], sensor["reset_noise"]) == (1, 0.006, 0.0009)
-    assert sensor["clock_ripple"] == sensor_of(made, cameras_of(made)[0]).clock_ripple == 0.008
+    assert sensor["clock_ripple"] == sensor_of(real, cameras_of(real)[0]).clock_ripple == 0.008
     known = [*training.streams, *(x for r in training.recordings for x in (r.flat, r.dark))]
     assert {x.dead_ticks for x in known} == {1.0}, "methods know the law"
     assert not {"dead_ticks", "psf_px"} & set(open_scene(ideal).meta["sensor"])
 
 
-def test_noise_of_other_sensors_changes_nothing_else(ideal, tmp_path, monkeypatch):
-    render_fakes(monkeypatch)
-    quiet, noisy = (open_scene(folder) for folder in (ideal, Maker(job(noisy_others=True), tmp_path, plain).make()))
+def test_noise_of_other_sensors_changes_nothing_else(ideal, made):
+    quiet, noisy = (open_scene(folder) for folder in (ideal, made(job(noisy_others=True))))
     assert noisy.id == "car-0-tiny-others" and noisy.revision == quiet.revision
     assert noisy.meta["source"]["physics"] == {"noisy_others": True}
     assert noisy.meta["conventional"]["noise"] == {"full_well": 10_700.0, "read": 2.9}

@@ -12,37 +12,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from changes import edit_json
 from full_scene import write_full_scene
 from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.scene.images import read_exr, read_geometry, write_exr, write_geometry
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
+from spike4dgs.generators import scene_check, scene_differences
 from spike4dgs.generators.profiles import PROFILES, Job
-from spike4dgs.generators.scene_check import (
-    CHANGE,
-    EQUAL,
-    MOST_OF_BLOCKS,
-    MOST_OF_CAMERA,
-    NOISE,
-    NOISE_FOLDER,
-    Comparison,
-    beyond_noise,
-    check_scenes,
-    find_references,
-    to_markdown,
-)
-from spike4dgs.generators.scene_differences import (
-    Difference,
-    bits_that_differ,
-    block_means,
-    difference,
-    differing_facts,
-    images_of,
-)
+from spike4dgs.generators.scene_check import CHANGE, EQUAL, NOISE, Comparison, find_references, to_markdown
+from spike4dgs.generators.scene_differences import Difference, difference
 
 
 def opened(root: Path) -> Scene:
@@ -55,22 +37,27 @@ def test_a_scene_does_not_differ_from_itself(tmp_path: Path) -> None:
     found = difference(scene, scene, "cam_03")
     assert (found.bits, found.spikes_block_rms, found.truth_rms, found.truth_block_max) == (0, 0, 0, 0)
     assert found.truth_db is None and difference(scene, scene, "cam_01").truth_rms is None
-    assert [t.tick for t in images_of(scene, "cam_03")] == [20, 40, 60]
+    assert [t.tick for t in scene_differences.images_of(scene, "cam_03")] == [20, 40, 60]
 
 
 def test_bits_are_those_of_plain_arrays() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.random((2, 700, 5, 7)) < 0.3
     streams = [SpikeStream(pack(x), 7, 5, 20000.0) for x in (a, b)]
-    assert math.isclose(bits_that_differ(*streams), np.mean(a != b))
+    assert math.isclose(scene_differences.bits_that_differ(*streams), np.mean(a != b))
+
+
+def brighten(root: Path, by: float) -> None:
+    """One block of all truths."""
+    for path in root.glob("images/cam_03/*.exr"):
+        image = np.array(read_exr(path))
+        image[8:16, 16:24] += by
+        write_exr(path, image, 0.0)
 
 
 def test_a_known_change_of_truth_is_measured(tmp_path: Path) -> None:
     a, b = open_scene(write_small_scene(tmp_path / "a")), write_small_scene(tmp_path / "b")
-    for path in b.glob("images/cam_03/*.exr"):
-        image = np.array(read_exr(path))
-        image[8:16, 16:24] += 0.125
-        write_exr(path, image, 0.0)
+    brighten(b, 0.125)
     found = difference(a, opened(b), "cam_03")
     share = 64 / (HEIGHT * WIDTH)
     assert found.truth_rms == pytest.approx(0.125 * math.sqrt(share), rel=0.01)
@@ -95,27 +82,25 @@ def test_a_silent_block_of_spikes_is_measured(tmp_path: Path) -> None:
 
 def test_block_means_leave_out_what_is_over() -> None:
     image = np.arange(20.0 * 17).reshape(20, 17)
-    found = block_means(image)
+    found = scene_differences.block_means(image)
     assert found.shape == (2, 2) and found[1, 1] == image[8:16, 8:16].mean()
 
 
 FLOOR = Difference(0.17, 1e-3, 4e-3, 5e-3, 1e-3, 4e-3)
 
 
-def compared(
-    found: Difference, noise: Difference = FLOOR, facts: tuple[str, ...] = (), same: bool = False
-) -> Comparison:
-    return Comparison("car-0-tiny", "a" * 64, ("a" if same else "b") * 64, facts, {"cam_00": found}, {"cam_00": noise})
+def compared(found: Difference, noise: Difference = FLOOR, facts: tuple[str, ...] = (), other: str = "b") -> Comparison:
+    return Comparison("car-0-tiny", "a" * 64, other * 64, facts, {"cam_00": found}, {"cam_00": noise})
 
 
 def test_the_verdict_is_by_revision_then_facts_then_noise() -> None:
-    assert compared(FLOOR, same=True).verdict == EQUAL
+    assert compared(FLOOR, other="a").verdict == EQUAL
     assert compared(FLOOR).verdict == NOISE and compared(FLOOR).reasons == []
     assert compared(FLOOR, facts=("n_ticks: 80, reference 400",)).verdict == CHANGE
     assert compared(Difference(0, 0, 0, 0, 0, 0)).verdict == NOISE
 
 
-LIMITS = MOST_OF_CAMERA | MOST_OF_BLOCKS
+LIMITS = scene_check.MOST_OF_CAMERA | scene_check.MOST_OF_BLOCKS
 
 
 @pytest.mark.parametrize("name", LIMITS)
@@ -129,11 +114,11 @@ def test_each_measure_alone_tells_a_change(name: str) -> None:
 def test_blocks_count_over_all_cameras_and_bits_by_camera() -> None:
     def of_three(name: str, factor: float) -> list[str]:
         noise = {f"cam_{i}": FLOOR for i in range(3)}
-        return beyond_noise(noise | {"cam_1": replace(FLOOR, **{name: factor * getattr(FLOOR, name)})}, noise)
+        louder = replace(FLOOR, **{name: factor * getattr(FLOOR, name)})
+        return scene_check.beyond_noise(noise | {"cam_1": louder}, noise)
 
-    assert of_three("bits", 1.3) == [
-        "cam_1: spike bits differ 1.3 times as much as by noise; up to 1.25 times is noise"
-    ]
+    (line,) = of_three("bits", 1.3)
+    assert line == "cam_1: spike bits differ 1.3 times as much as by noise; up to 1.25 times is noise"
     assert of_three("truth_block_rms", 2.6) == []  # sqrt((1 + 1 + 2.6^2) / 3) = 1.71
     (line,) = of_three("truth_block_rms", 2.8)
     assert line.startswith("all cameras: truths in blocks differ 1.81 times")
@@ -153,19 +138,14 @@ def test_the_report_has_the_figures_beside_those_of_noise() -> None:
     assert "| car-0-tiny | change of the world | aaaaaaaaaaaaaaaa | bbbbbbbbbbbbbbbb |" in text
     assert "| cam_00 | 50.000% | 17.000% | 20.0 | 46.0 | 1.00e-03 | 1.00e-03 | 1.00e-03 | 1.00e-03 |" in text
     assert "- cam_00: spike bits differ 2.94 times as much as by noise; up to 1.25 times is noise" in text
-    assert to_markdown([compared(FLOOR, same=True)]).count("## car-0-tiny: equal") == 1
+    assert to_markdown([compared(FLOOR, other="a")]).count("## car-0-tiny: equal") == 1
 
 
 JOB = Job("pattern", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 
 
 def edit(name: str, change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
-    def apply(root: Path) -> None:
-        data = json.loads((root / name).read_text())
-        change(data)
-        write_json(root / name, data)
-
-    return apply
+    return lambda root: edit_json(root / name, change)
 
 
 def add_noise(root: Path, seed: int) -> None:
@@ -202,7 +182,7 @@ def check(out: Path, references: Path) -> tuple[int, dict[str, Any]]:
         shutil.copytree(out.parent / "plain", folder / job.id)
         add_noise(folder / job.id, 7)
 
-    code = check_scenes([JOB], out, find_references(references, [JOB.id]), make)
+    code = scene_check.check_scenes([JOB], out, find_references(references, [JOB.id]), make)
     return code, json.loads((out / "check.json").read_text())["scenes"][0]
 
 
@@ -217,7 +197,7 @@ def test_the_same_data_are_equal_without_another_rendering(scenes: tuple[Path, P
     change(Path(shutil.copytree(out / JOB.id, scenes[1] / JOB.id)), edit("scene.json", lambda m: m.update(title="x")))
     code, found = check(out, scenes[1])
     assert (code, found["verdict"], found["cameras"]) == (0, "equal", {})
-    assert not (out / NOISE_FOLDER).exists() and not (out / "check.png").exists()
+    assert not (out / scene_check.NOISE_FOLDER).exists() and not (out / "check.png").exists()
 
 
 def test_other_noise_is_rendering_noise(scenes: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
@@ -231,17 +211,9 @@ def test_other_noise_is_rendering_noise(scenes: tuple[Path, Path], capsys: pytes
     assert (out / "check.png").stat().st_size > 10_000 and "rendering noise" in (out / "check.md").read_text()
 
 
-def brighter(root: Path) -> None:
-    """One block of all truths, by as much as the noise of one pixel."""
-    for path in root.glob("images/cam_03/*.exr"):
-        image = np.array(read_exr(path))
-        image[8:16, 16:24] += 0.02
-        write_exr(path, image, 0.0)
-
-
-def moved(transforms: dict[str, Any]) -> None:
+def moved(transforms: dict[str, Any], change: Callable[[float], float] = lambda x: x + 1e-6) -> None:
     for frame in transforms["frames"]:
-        frame["transform_matrix"][0][3] += 1e-6
+        frame["transform_matrix"][0][3] = change(frame["transform_matrix"][0][3])
 
 
 def deeper(root: Path) -> None:
@@ -259,7 +231,7 @@ def other_map(root: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "reason"),
     [
-        (brighter, "all cameras: truths in"),
+        (lambda root: brighten(root, 0.02), "all cameras: truths in"),  # as the noise of one pixel
         (edit("transforms_train.json", moved), "pose of cam_00: by up to 1e-06"),
         (edit("targets.json", lambda t: t["targets"].pop()), "targets of center"),
         (edit("scene.json", lambda m: m.update(radiance_gain=0.61)), "radiance_gain: 0.6, reference 0.61"),
@@ -290,13 +262,8 @@ def test_a_reference_of_another_size_is_a_change(scenes: tuple[Path, Path]) -> N
 
 def test_facts_that_differ_by_rounding_are_the_same(scenes: tuple[Path, Path]) -> None:
     out, references = scenes
-
-    def rounded(transforms: dict[str, Any]) -> None:
-        for frame in transforms["frames"]:
-            frame["transform_matrix"][0][3] = np.nextafter(frame["transform_matrix"][0][3], 9.0)
-
-    change(references / JOB.id, edit("transforms_train.json", rounded))
-    assert differing_facts(open_scene(out / JOB.id), open_scene(references / JOB.id)) == []
+    change(references / JOB.id, edit("transforms_train.json", lambda t: moved(t, lambda x: np.nextafter(x, 9.0))))
+    assert scene_differences.differing_facts(open_scene(out / JOB.id), open_scene(references / JOB.id)) == []
 
 
 def test_a_reference_that_is_missing_is_named(scenes: tuple[Path, Path]) -> None:
