@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -15,12 +16,10 @@ from spike4dgs.generators.held_frames.footage import find_footage, read_frames
 WIDTH, HEIGHT = 32, 16
 
 
-def write_images(
-    folder: Path, values: list[int], suffix: str = ".png", size: tuple[int, int] = (WIDTH, HEIGHT)
-) -> None:
+def write_images(folder: Path, values: list[int]) -> None:
     folder.mkdir(parents=True)
     for k, value in enumerate(values):
-        Image.new("L", size, value).save(folder / f"img_{k}{suffix}")
+        Image.new("L", (WIDTH, HEIGHT), value).save(folder / f"img_{k}.png")
 
 
 def test_images_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
@@ -56,66 +55,38 @@ def test_colour_and_palette_images_are_rgb(tmp_path: Path) -> None:
     assert first.shape == (HEIGHT, WIDTH, 3) and (first == (10, 20, 30)).all() and (second == first).all()
 
 
-def damaged(folder: Path) -> None:
-    (folder / "cam_1/img_0.png").write_bytes(b"no image")
-
-
 def other_size(folder: Path) -> None:
     for path in (folder / "cam_1").iterdir():
         Image.new("L", (WIDTH, HEIGHT + 1)).save(path)
 
 
-def other_length(folder: Path) -> None:
-    (folder / "cam_1/img_1.png").unlink()
+def colour(name: str) -> Callable[[Path], object]:
+    """Put an image of 16 bits a channel in the place of the first one."""
+
+    def change(folder: Path) -> None:
+        (folder / "cam_1/img_0.png").unlink()
+        cv2.imwrite(str(folder / "cam_1" / name), np.full((HEIGHT, WIDTH, 3), 300, np.uint16))
+
+    return change
 
 
-def sixteen_bits(folder: Path) -> None:
-    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16)).save(folder / "cam_1/img_0.png")
+WIDE = Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16))
+REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
+    "damaged": (lambda f: (f / "cam_1/img_0.png").write_bytes(b"no image"), "an image"),
+    "another size": (other_size, "one size for all cameras"),
+    "another length": (lambda f: (f / "cam_1/img_1.png").unlink(), "the same number of frames"),
+    "16 bits": (lambda f: WIDE.save(f / "cam_1/img_0.png"), "8 bits a channel"),
+    "16 bits of colour": (colour("img_0.png"), "8 bits a channel, found mode RGB, of more bits"),
+    "16 bits of colour in a TIFF": (colour("img_0.tiff"), "8 bits a channel, found mode RGB, of more bits"),
+    "a camera twice": (lambda f: (f / "cam_1.mp4").write_bytes(b"no video"), "a video"),
+    "no video": (lambda f: (f / "cam_2.mp4").write_bytes(b"no video"), "a video"),
+    "an odd name": (lambda f: (f / "cam_1").rename(f / "cam 1!"), "the id of a camera"),
+    "nothing": (lambda f: [path.unlink() for path in f.glob("*/*")], "a subfolder of images, or a video"),
+}
 
 
-def sixteen_bits_of_colour(folder: Path) -> None:
-    cv2.imwrite(str(folder / "cam_1/img_0.png"), np.full((HEIGHT, WIDTH, 3), 300, np.uint16))
-
-
-def sixteen_bits_of_colour_in_a_tiff(folder: Path) -> None:
-    (folder / "cam_1/img_0.png").unlink()
-    cv2.imwrite(str(folder / "cam_1/img_0.tiff"), np.full((HEIGHT, WIDTH, 3), 300, np.uint16))
-
-
-def twice(folder: Path) -> None:
-    (folder / "cam_1.mp4").write_bytes(b"no video")
-
-
-def bad_video(folder: Path) -> None:
-    (folder / "cam_2.mp4").write_bytes(b"no video")
-
-
-def odd_name(folder: Path) -> None:
-    (folder / "cam_1").rename(folder / "cam 1!")
-
-
-def nothing(folder: Path) -> None:
-    for path in folder.glob("*/*"):
-        path.unlink()
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (damaged, "an image"),
-        (other_size, "one size for all cameras"),
-        (other_length, "the same number of frames"),
-        (sixteen_bits, "8 bits a channel"),
-        (sixteen_bits_of_colour, "8 bits a channel, found mode RGB, of more bits"),
-        (sixteen_bits_of_colour_in_a_tiff, "8 bits a channel, found mode RGB, of more bits"),
-        (twice, "a video"),
-        (bad_video, "a video"),
-        (odd_name, "the id of a camera"),
-        (nothing, "a subfolder of images, or a video"),
-    ],
-    ids=lambda value: getattr(value, "__name__", ""),
-)
-def test_other_footage_is_refused(tmp_path: Path, change, expected: str) -> None:  # type: ignore[no-untyped-def]
+@pytest.mark.parametrize(("change", "expected"), REFUSED.values(), ids=REFUSED)
+def test_other_footage_is_refused(tmp_path: Path, change: Callable[[Path], object], expected: str) -> None:
     for camera in ("cam_0", "cam_1"):
         write_images(tmp_path / camera, [0, 100])
     change(tmp_path)

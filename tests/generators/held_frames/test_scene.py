@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,8 @@ from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.camera_files import read_camera_files
-from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.cli import main
 from spike4dgs.generators.held_frames.footage import find_footage
 from spike4dgs.generators.held_frames.scene import Holding, moving_regions, write_held_frames
@@ -39,6 +41,13 @@ def write_footage(folder: Path, colour: bool = False) -> Path:
     return folder
 
 
+def write_scene(folder: Path, colour: bool = False, cameras: tuple[Camera, ...] = CAMERAS, **changes: Any) -> Scene:
+    """Write footage and hold its frames."""
+    footage = find_footage(write_footage(folder / "footage", colour))
+    write_held_frames(folder / "scene", footage, cameras, replace(HOLDING, **changes))
+    return open_scene(folder / "scene")
+
+
 def light_of(image: np.ndarray, linear: bool) -> np.ndarray:
     """Radiance of half-size pixels, by the definition of sRGB and by hand."""
     x = image / 255
@@ -49,9 +58,7 @@ def light_of(image: np.ndarray, linear: bool) -> np.ndarray:
 
 @pytest.mark.parametrize("linear", [False, True])
 def test_truth_and_spikes_are_the_light_of_the_frames(tmp_path: Path, linear: bool) -> None:
-    footage = find_footage(write_footage(tmp_path / "footage"))
-    write_held_frames(tmp_path / "scene", footage, CAMERAS, replace(HOLDING, linear=linear))
-    scene = open_scene(tmp_path / "scene")
+    scene = write_scene(tmp_path, linear=linear)
     assert (scene.n_ticks, scene.train, scene.test) == (600, ("cam_00", "cam_02"), ("cam_01",))
     assert [t.tick for t in scene.targets] == [100, 300, 500]
     for k, target in enumerate(scene.targets):
@@ -65,9 +72,7 @@ def test_truth_and_spikes_are_the_light_of_the_frames(tmp_path: Path, linear: bo
 
 
 def test_colour_is_kept_in_the_truth_and_gray_is_what_the_sensors_see(tmp_path: Path) -> None:
-    footage = find_footage(write_footage(tmp_path / "footage", colour=True))
-    write_held_frames(tmp_path / "scene", footage, CAMERAS, HOLDING)
-    scene = open_scene(tmp_path / "scene")
+    scene = write_scene(tmp_path, colour=True)
     light = light_of(frame(1, 0, colour=True), linear=False)
     np.testing.assert_allclose(scene.ground_truth_rgb(scene.targets[0]), light, atol=5e-4)
     weights = np.array([0.2127, 0.7152, 0.0722])  # of CIE Y
@@ -75,18 +80,15 @@ def test_colour_is_kept_in_the_truth_and_gray_is_what_the_sensors_see(tmp_path: 
 
 
 def test_the_shrunk_camera_sees_points_where_the_shrunk_frames_show_them(tmp_path: Path) -> None:
-    footage = find_footage(write_footage(tmp_path / "footage"))
     bent = tuple(replace(c, distortion=(-0.2, 0.05, 0.001, 0.0, 0.0)) for c in CAMERAS)
-    write_held_frames(tmp_path / "scene", footage, bent, HOLDING)
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3))
-    small = open_scene(tmp_path / "scene").cameras
+    small = write_scene(tmp_path, cameras=bent).cameras
     for camera in bent:
         np.testing.assert_allclose(small[camera.id].project(points)[0], camera.project(points)[0] / 2, atol=1e-9)
 
 
 def test_its_calibration_is_that_of_the_sensors(tmp_path: Path) -> None:
-    footage = find_footage(write_footage(tmp_path / "footage"))
-    write_held_frames(tmp_path / "scene", footage, CAMERAS, HOLDING)
+    write_scene(tmp_path)
     assert main(["calibrate", str(tmp_path / "scene"), "--out", str(tmp_path / "maps")]) == 0
     found = np.load(next(tmp_path.glob("maps/**/cam_00.npz")))
     true = np.load(tmp_path / "scene/truth/cam_00.npz")
@@ -94,12 +96,8 @@ def test_its_calibration_is_that_of_the_sensors(tmp_path: Path) -> None:
 
 
 def test_the_same_footage_gives_the_same_scene_and_another_seed_another(tmp_path: Path) -> None:
-    footage = find_footage(write_footage(tmp_path / "footage"))
-    revisions = []
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        write_held_frames(tmp_path / name / "scene", footage, CAMERAS, replace(HOLDING, seed=seed))
-        revisions.append(open_scene(tmp_path / name / "scene").revision)
-    assert revisions[0] == revisions[1] != revisions[2]
+    first, again, other = (write_scene(tmp_path / f"{k}", seed=seed).revision for k, seed in enumerate((0, 0, 1)))
+    assert first == again != other
 
 
 def test_what_moves_is_found_and_nothing_else() -> None:
@@ -131,9 +129,8 @@ def test_what_moves_is_found_and_nothing_else() -> None:
 def test_settings_that_do_not_fit_are_refused_before_anything_is_written(
     tmp_path: Path, change: dict[str, object], option: str
 ) -> None:
-    footage = find_footage(write_footage(tmp_path / "footage"))
     with pytest.raises(UserError, match=f"^{option}: expected"):
-        write_held_frames(tmp_path / "scene", footage, CAMERAS, replace(HOLDING, **change))  # type: ignore[arg-type]
+        write_scene(tmp_path, **change)
     assert not (tmp_path / "scene").exists()
 
 
@@ -153,8 +150,8 @@ def test_the_command_prints_errors_of_cameras_and_writes_the_scene(
     file.release()
     (tmp_path / "points.csv").write_text("\n".join(marks) + "\n")
     arguments = ["import-frames", str(write_footage(tmp_path / "footage")), "--cameras", str(tmp_path / "cameras.yml")]
-    arguments += ["--held-out", "cam_01", "--width", "40", "--points", str(tmp_path / "points.csv")]
-    assert main([*arguments, "--out", str(tmp_path / "scene")]) == 0
+    arguments += ["--points", str(tmp_path / "points.csv"), "--out", str(tmp_path / "scene")]
+    assert main([*arguments, "--held-out", "cam_01", "--width", "40"]) == 0
     printed = capsys.readouterr().out
     assert "cam_02      3" in printed and "5 instants, 500 ticks, 25 ms" in printed
     assert main(["verify", str(tmp_path / "scene")]) == 0

@@ -15,42 +15,36 @@ def poses(world: WorldScene, t_s: float) -> np.ndarray:
     return np.stack(list(world.poses(t_s).values()))
 
 
-@pytest.fixture(scope="module", params=sorted(TRAINING_WORLDS))
-def name(request: pytest.FixtureRequest) -> str:
-    return request.param
+def build(name: str, variant: int = 13) -> WorldScene:
+    return TRAINING_WORLDS[name].build(0, variant, 0.1)
 
 
-@pytest.fixture(scope="module")
-def world(name: str) -> WorldScene:
-    return TRAINING_WORLDS[name].build(0, 13, 0.1)
+every_world = pytest.mark.parametrize("name", sorted(TRAINING_WORLDS))
 
 
 def test_they_are_not_the_benchmarks() -> None:
     assert not set(TRAINING_WORLDS) & set(WORLDS)
 
 
-def test_bodies_are_rigid_and_fall_as_they_should(name: str, world: WorldScene) -> None:
-    before, now, after = (poses(world, 0.05 + k * STEP_S) for k in (-1, 0, 1))
+@every_world
+def test_bodies_are_rigid_and_fall_as_they_should(name: str) -> None:
+    before, now, after = (poses(build(name), 0.05 + k * STEP_S) for k in (-1, 0, 1))
     turns = now[:, :3, :3]
     np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turns.shape), atol=1e-12)
     acceleration = (before - 2 * now + after)[:, :3, 3] / STEP_S**2
     expected = (0, 0, -9.81) if name == "tumble" else (0, 0, 0)
     np.testing.assert_allclose(acceleration, np.broadcast_to(expected, acceleration.shape), atol=1e-6)
-    # A constant spin: the turn from one step to the next is always the same one.
-    np.testing.assert_allclose(
-        after[:, :3, :3] @ turns.transpose(0, 2, 1), turns @ before[:, :3, :3].transpose(0, 2, 1), atol=1e-9
-    )
+    spins = [b[:, :3, :3] @ a[:, :3, :3].transpose(0, 2, 1) for a, b in ((before, now), (now, after))]
+    np.testing.assert_allclose(*spins, atol=1e-9)  # constant
     moved = np.linalg.norm((after - before)[:, :3, 3], axis=1)
     assert (moved == 0).all() if name == "whirl" else (moved > 0).all()
 
 
-def test_a_variant_is_a_function_of_its_number(name: str, world: WorldScene) -> None:
-    build = TRAINING_WORLDS[name].build
-    same, other = build(0, 13, 0.1), build(0, 14, 0.1)
-    np.testing.assert_array_equal(same.moving_points(0.03), world.moving_points(0.03))
-    assert other.moving_points(0.03).shape != world.moving_points(0.03).shape or not np.allclose(
-        other.moving_points(0.03), world.moving_points(0.03)
-    )
+@every_world
+def test_a_variant_is_a_function_of_its_number(name: str) -> None:
+    first, same, other = (build(name, variant).moving_points(0.03) for variant in (13, 13, 14))
+    np.testing.assert_array_equal(same, first)
+    assert other.shape != first.shape or not np.allclose(other, first)
 
 
 def test_textures_are_reflectances_that_differ() -> None:
