@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import pytest
 from dummy_methods import CountMethod, FailingMethod, run
 from small_scenes import write_small_scene
-from submissions import enter
+from submissions import enter, release_of
 
 from spike4dgs.benchmark import plugins
+from spike4dgs.cli.verify_leaderboard import verify_leaderboard
 
 
 @pytest.fixture(scope="session")
@@ -42,6 +44,32 @@ def entered_once(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def entered(entered_once: Path, tmp_path: Path) -> Path:
     """A copy of the run that a test may damage, with an entry of tfp+4dgs in `board`."""
     return Path(shutil.copytree(entered_once, tmp_path / "run"))
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
+    """What has been printed since the last question, errors included."""
+    return lambda: "".join(capsys.readouterr())
+
+
+@pytest.fixture
+def released(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A release whose tracks have the run's two scenes."""
+    release_of(done, monkeypatch)
+
+
+@pytest.fixture
+def problems(capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
+    """What `verify-leaderboard` finds in the board beside a run, line by line."""
+
+    def found(done: Path, **options: Any) -> list[str]:
+        capsys.readouterr()
+        code = verify_leaderboard(done / "board", **options)
+        lines = capsys.readouterr().err.splitlines()
+        assert code == (1 if lines else 0)
+        return lines
+
+    return found
 
 
 @pytest.fixture

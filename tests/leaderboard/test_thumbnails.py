@@ -14,13 +14,12 @@ import pytest
 from changes import edit_json, files_in
 from dummy_methods import CountMethod, run
 from PIL import Image
-from submissions import edit_with_ledger, enter, entry_of, read, submit
+from submissions import edit_with_ledger, enter, entry_of, files_of, read, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.error_map import SCALES
 from spike4dgs.benchmark.reports.panels import Box
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_mask
-from spike4dgs.cli import main
 from spike4dgs.leaderboard import entry, thumbnails
 from spike4dgs.leaderboard.thumbnails import read_sheet, sheet_path
 from spike4dgs.leaderboard.verify import verify_leaderboard
@@ -30,15 +29,6 @@ MIDDLE, WIDTH, HEIGHT = "cam_03/000040", 40, 24
 
 def pixels(sheet: Path) -> np.ndarray:
     return np.asarray(Image.open(sheet).convert("L")).astype(float)
-
-
-def problems(done: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """What `verify-leaderboard` finds."""
-    capsys.readouterr()
-    code = main(["verify-leaderboard", str(done / "board")])
-    lines = capsys.readouterr().err.splitlines()
-    assert code == bool(lines)
-    return lines
 
 
 def test_the_sheet_shows_what_was_scored_and_the_entry_states_it(done: Path) -> None:
@@ -106,28 +96,23 @@ def test_another_record_has_another_sheet_or_none(entered: Path) -> None:
     assert not sheet_path(path).exists()
 
 
-def test_the_sheet_of_a_removed_entry_is_found_and_the_next_submission_removes_it(
-    entered: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_sheet_of_a_removed_entry_is_found_and_the_next_submission_removes_it(entered: Path, problems: Any) -> None:
     path = entry_of(entered)
     enter(entered, "rough")
-    assert problems(entered, capsys) == []
+    assert problems(entered) == []
     path.unlink()
-    assert f"error: {sheet_path(path)}: expected no such file, as no entry states it; remove it" in problems(
-        entered, capsys
-    )
+    line = f"error: {sheet_path(path)}: expected no such file, as no entry states it; remove it"
+    assert line in problems(entered)
     enter(entered, "rough")
-    assert not sheet_path(path).exists() and problems(entered, capsys) == []
+    assert not sheet_path(path).exists() and problems(entered) == []
 
 
-def test_an_entry_without_its_sheet_gets_it_again_and_keeps_all_else(
-    entered: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_entry_without_its_sheet_gets_it_again_and_keeps_all_else(entered: Path, problems: Any) -> None:
     """Without any, as entries were before sheets, and with one that is not there."""
     path = entry_of(entered)
     before, name = files_in(entered / "board"), path.relative_to(entered / "board").as_posix()
     sheet_path(path).unlink()
-    (line,) = problems(entered, capsys)
+    (line,) = problems(entered)
     assert f"{sheet_path(path)}: expected the thumbnails that its entry states, found no such file" in line
     enter(entered, verified=False)
     assert not sheet_path(path).exists()
@@ -136,7 +121,7 @@ def test_an_entry_without_its_sheet_gets_it_again_and_keeps_all_else(
     sheet_path(path).unlink()
     edit_with_ledger(path, lambda e: e.pop("thumbnails"))
     enter(entered)
-    assert files_in(entered / "board")[name] == before[name] and problems(entered, capsys) == []
+    assert files_in(entered / "board")[name] == before[name] and problems(entered) == []
 
 
 def test_a_killed_submission_leaves_a_sheet_that_blocks_nobody(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,13 +139,18 @@ def test_a_killed_submission_leaves_a_sheet_that_blocks_nobody(done: Path, monke
     assert read_sheet(sheet_path(path), read(path)["thumbnails"])
 
 
-def test_an_exchanged_sheet_is_found(entered: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_exchanged_sheet_is_found(entered: Path, problems: Any) -> None:
     path, other = entry_of(entered), enter(entered, "rough")
     sheet_path(path).write_bytes(sheet_path(other).read_bytes())
-    (line,) = problems(entered, capsys)
-    assert line.startswith(
-        f"error: {sheet_path(path)}: expected sha256 {read(path)['thumbnails']['sha256'][:16]}... as"
-    )
+    (line,) = problems(entered)
+    stated = read(path)["thumbnails"]["sha256"]
+    assert line.startswith(f"error: {sheet_path(path)}: expected sha256 {stated[:16]}... as")
+
+
+def forged(path: Path, sheet: bytes) -> None:
+    """Exchange a sheet as somebody who also knows the entry and the ledger would."""
+    sheet_path(path).write_bytes(sheet)
+    edit_with_ledger(path, lambda e: e["thumbnails"].update(sha256=hashlib.sha256(sheet).hexdigest()))
 
 
 def lossy(width: int, height: int) -> bytes:
@@ -168,23 +158,24 @@ def lossy(width: int, height: int) -> bytes:
     return b"RIFF\0\0\0\0WEBPVP8 \0\0\0\0\0\0\0\x9d\x01\x2a" + struct.pack("<HH", width, height) + b"\0" * 64
 
 
-def png() -> bytes:
+def encoded(image: Image.Image, kind: str, **options: int) -> bytes:
     out = io.BytesIO()
-    Image.new("L", (120, 48)).save(out, "PNG")
+    image.save(out, kind, **options)
     return out.getvalue()
+
+
+PNG = encoded(Image.new("L", (120, 48)), "PNG")
 
 
 @pytest.mark.parametrize(
     ("content", "found"),
-    [(lossy(16383, 16383), "16383x16383"), (lossy(120, 49), "120x49"), (png(), "another file"), (b"", "another file")],
+    [(lossy(16383, 16383), "16383x16383"), (lossy(120, 49), "120x49"), (PNG, "another file"), (b"", "another file")],
 )
 def test_an_image_of_another_size_or_kind_is_no_sheet_whatever_its_hash(
-    entered: Path, content: bytes, found: str, capsys: pytest.CaptureFixture[str]
+    entered: Path, content: bytes, found: str, problems: Any
 ) -> None:
-    path = entry_of(entered)
-    sheet_path(path).write_bytes(content)
-    edit_with_ledger(path, lambda e: e["thumbnails"].update(sha256=hashlib.sha256(content).hexdigest()))
-    (line,) = [line for line in problems(entered, capsys) if "leaderboard.json" not in line]
+    forged(entry_of(entered), content)
+    (line,) = [line for line in problems(entered) if "leaderboard.json" not in line]
     assert f"expected a lossy WebP image of 120x48 pixels, found {found};" in line
 
 
@@ -202,33 +193,21 @@ def test_an_edit_of_what_the_sheet_shows_is_an_edit_of_the_entry(entered: Path) 
         read(path)
 
 
-def forged(path: Path, sheet: bytes) -> None:
-    """Exchange a sheet as somebody who also knows the entry and the ledger would."""
-    sheet_path(path).write_bytes(sheet)
-    edit_with_ledger(path, lambda e: e["thumbnails"].update(sha256=hashlib.sha256(sheet).hexdigest()))
-
-
 def test_a_sheet_that_shows_other_images_is_found_where_the_entry_is_scored_again(entered: Path) -> None:
     path = entry_of(entered)
     honest = sheet_path(path).read_bytes()
-    scenes, predictions = (entered / "s0", entered / "s1"), entered / "out/predictions"
-    levels = np.asarray(Image.open(sheet_path(path)).convert("L"))
-    other = levels.copy()
+    image = Image.open(sheet_path(path)).convert("L")
+    other = np.array(image)
     other[30:40, 50:60] = 255 - other[30:40, 50:60]
-
-    def encoded(image: np.ndarray, quality: int) -> bytes:
-        out = io.BytesIO()
-        Image.fromarray(image).convert("RGB").save(out, "WEBP", quality=quality)
-        return out.getvalue()
 
     def found() -> list[str]:
         submit(entered / "out/results/bad.json", leaderboard=entered / "board")  # writes the boards anew
         assert not verify_leaderboard(entered / "board").problems
-        return list(verify_leaderboard(entered / "board", predictions, scenes).problems)
+        return list(verify_leaderboard(entered / "board", **files_of(entered)).problems)
 
-    forged(path, encoded(levels, 40))
+    forged(path, encoded(image.convert("RGB"), "WEBP", quality=40))
     assert found() == [], "another encoder"
-    forged(path, encoded(other, 90))
+    forged(path, encoded(Image.fromarray(other).convert("RGB"), "WEBP", quality=90))
     (line,) = found()
     assert line.startswith(f"{sheet_path(path)}: expected the images that were scored, found others, by ")
     forged(path, honest[:200] + b"\0" * (len(honest) - 200))

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from changes import edit_json, exchange
+from changes import edit_json, exchange, flip_bit
 from dummy_methods import CountMethod, run
 from nosy_methods import Darker, PlaysBack
-from submissions import board, edit_with_ledger, enter, entry_of, raise_metric, read, release_of, submit
+from submissions import board, edit_with_ledger, enter, entry_of, files_of, raise_metric, read, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
@@ -27,16 +27,6 @@ from spike4dgs.leaderboard import tracks, verify
 from spike4dgs.leaderboard.truth_check import TruthCheck, check_truth
 
 
-def test_scores_that_the_files_do_not_give_are_refused(done: Path) -> None:
-    edit_json(done / "out/results/tfp+4dgs.json", lambda record: raise_metric(record, "psnr", 0.01))
-    with pytest.raises(
-        UserError, match=r"scene pattern-0, cam_03/0000\d0: expected psnr = .* as computed from the files"
-    ):
-        enter(done)
-    assert not (done / "board").exists()
-    assert read(enter(done, verified=False))["verification"]["label"] == "claimed"
-
-
 def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
     edit_json(done / "out/results/tfp+4dgs.json", lambda record: raise_metric(record, "psnr", 1e-7))
     assert read(enter(done))["verification"]["label"] == "re-scored"
@@ -45,10 +35,8 @@ def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda r: r["scenes"]["pattern-0"].update(predictions_sha256="0" * 64),
-            "expected predictions 00000000",
-        ),
+        (lambda r: raise_metric(r, "psnr", 0.01), r"scene pattern-0, cam_03/0000\d0: expected psnr = .* as computed"),
+        (lambda r: r["scenes"]["pattern-0"].update(predictions_sha256="0" * 64), "expected predictions 00000000"),
         (lambda r: r["scenes"]["pattern-1"].update(fit_seconds=1e-3), "expected fit_seconds"),
         (lambda r: r["sensors"].update({"pattern-1": "noisy"}), "pattern-1: expected sensor not stated, found noisy"),
         (lambda r: r["scenes"]["pattern-1"].update(gain_aligned=7.0), "expected gain_aligned"),
@@ -61,29 +49,34 @@ def test_rounding_below_the_tolerance_is_no_forgery(done: Path) -> None:
 )
 def test_records_that_the_files_contradict_are_refused(done: Path, change: Any, message: str) -> None:
     edit_json(done / "out/results/tfp+4dgs.json", change)
-    with pytest.raises(UserError) as e:
+    with pytest.raises(UserError, match=message) as e:
         enter(done)
-    assert message in str(e.value) and "\n" not in str(e.value)
-    assert not (done / "board").exists()
+    assert "\n" not in str(e.value) and not (done / "board").exists()
 
 
-def test_damaged_predictions_are_refused_by_name(done: Path) -> None:
-    path = done / "out/predictions/tfp+4dgs/pattern-1/cam_03/000040.exr"
-    path.write_bytes(path.read_bytes()[:-1] + b"\1")
-    with pytest.raises(UserError, match=r"pattern-1/cam_03/000040\.exr: expected sha256"):
+def test_an_exchanged_truth_is_refused(done: Path) -> None:
+    gray = np.full((24, 40), 0.5, np.float32)
+    exchange(done / "s0", "images/cam_03/000040.exr", lambda path: write_exr(path, gray, 2000.0))
+    with pytest.raises(UserError, match=r"images/cam_03/000040\.exr: expected content"):
         enter(done)
 
 
-def test_missing_predictions_and_paths_are_refused(done: Path) -> None:
-    shutil.rmtree(done / "out/predictions/tfp+4dgs/pattern-1")
-    with pytest.raises(UserError, match="pattern-1: expected a predictions folder"):
-        enter(done)
+def test_other_damaged_and_missing_files_are_refused_by_name(done: Path) -> None:
+    folder = done / "out/predictions/tfp+4dgs/pattern-1"
     with pytest.raises(UserError, match="nowhere: expected a predictions folder"):
         enter(done, predictions=done / "nowhere")
     with pytest.raises(UserError, match="nowhere: expected a scene folder"):
         enter(done, scenes=(done / "nowhere",))
     with pytest.raises(UserError, match=r"nothing\.json: expected a spike4dgs-result/1 record, found no such file"):
         submit(done / "nothing.json", leaderboard=done / "board")
+    with pytest.raises(UserError, match="give the predictions that were scored"):
+        enter(done, predictions=done / "out/predictions/rough")
+    flip_bit(folder / "cam_03/000040.exr", -1)
+    with pytest.raises(UserError, match=r"pattern-1/cam_03/000040\.exr: expected sha256"):
+        enter(done)
+    shutil.rmtree(folder)
+    with pytest.raises(UserError, match="pattern-1: expected a predictions folder"):
+        enter(done)
 
 
 @pytest.mark.parametrize(
@@ -101,18 +94,6 @@ def test_options_that_would_verify_nothing_are_refused(done: Path, options: dict
         verify_leaderboard(done / "board", **options)
 
 
-def test_other_predictions_of_the_method_are_refused(done: Path) -> None:
-    with pytest.raises(UserError, match="give the predictions that were scored"):
-        enter(done, predictions=done / "out/predictions/rough")
-
-
-def test_an_exchanged_truth_is_refused(done: Path) -> None:
-    gray = np.full((24, 40), 0.5, np.float32)
-    exchange(done / "s0", "images/cam_03/000040.exr", lambda path: write_exr(path, gray, 2000.0))
-    with pytest.raises(UserError, match=r"images/cam_03/000040\.exr: expected content"):
-        enter(done)
-
-
 @pytest.fixture
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A machine that has weights for MetaIQA (random ones) and nothing else."""
@@ -126,7 +107,7 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
-    done: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    done: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, said: Any
 ) -> None:
     run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
     monkeypatch.delenv(VARIABLE)
@@ -135,7 +116,7 @@ def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
     entry = read(enter(done, "with"))
     assert (entry["verification"]["label"], entry["verification"]["unverified"]) == ("re-scored", ["metaiqa"])
     assert entry["record"]["mean"]["metaiqa"] > 0 and board(done)["boards"][0]["rows"][0]["unverified"] == ["metaiqa"]
-    assert "with: re-scored (as claimed, not computed again: metaiqa), rank 1" in capsys.readouterr().out
+    assert "with: re-scored (as claimed, not computed again: metaiqa), rank 1" in said()
     monkeypatch.setenv(VARIABLE, str(weights))
     path = enter(done, "with")
     assert read(path)["verification"]["unverified"] == []
@@ -177,33 +158,15 @@ def test_predictions_of_another_program_are_scored_and_verified(done: Path) -> N
     assert row["rank"] == 1 and row["costs"]["fit_seconds"]["claimed"] is None and row["mean"] == ours["mean"]
 
 
-def problems(done: Path, capsys: pytest.CaptureFixture[str], **options: Any) -> list[str]:
-    capsys.readouterr()
-    code = verify_leaderboard(done / "board", **options)
-    lines = capsys.readouterr().err.splitlines()
-    assert code == (1 if lines else 0)
-    return lines
-
-
-def files(done: Path) -> dict[str, Any]:
-    return {"predictions": done / "out/predictions", "scenes": (done / "s0", done / "s1")}
-
-
-def test_what_submit_writes_has_no_problems(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    release_of(done, monkeypatch)
+def test_what_submit_writes_has_no_problems(done: Path, released: None, said: Any, problems: Any) -> None:
     enter(done)
     enter(done, "bad", verified=False)
-    assert not problems(done, capsys)
-    assert not problems(done, capsys, **files(done))
-    verify_leaderboard(done / "board", **files(done))
-    assert "release 2, 2 entries, 1 scored again, no problems" in capsys.readouterr().out
+    assert not problems(done)
+    assert verify_leaderboard(done / "board", **files_of(done)) == 0
+    assert "release 2, 2 entries, 1 scored again, no problems" in said()
 
 
-def test_entries_of_other_seeds_and_other_scenes_of_the_same_names_are_passed_over(
-    entered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_entries_of_other_seeds_and_other_scenes_of_the_same_names_are_passed_over(entered: Path, said: Any) -> None:
     """They are honest, and what was given is not theirs."""
     record = entered / "out/results/tfp+4dgs.json"
     forged = json.loads(record.read_text())
@@ -212,11 +175,10 @@ def test_entries_of_other_seeds_and_other_scenes_of_the_same_names_are_passed_ov
         ("scene", lambda: forged["dataset"]["scenes"].update({"pattern-0": "0" * 64})),
     ):
         change()
-        (tmp_path / f"{name}.json").write_text(json.dumps(forged))
-        assert submit(tmp_path / f"{name}.json", leaderboard=entered / "board") == 0
-    assert not problems(entered, capsys, **files(entered))
-    assert verify_leaderboard(entered / "board", **files(entered)) == 0
-    assert "3 entries, 1 scored again" in capsys.readouterr().out
+        (entered / f"{name}.json").write_text(json.dumps(forged))
+        assert submit(entered / f"{name}.json", leaderboard=entered / "board") == 0
+    assert verify_leaderboard(entered / "board", **files_of(entered)) == 0
+    assert "3 entries, 1 scored again" in said()
 
 
 @pytest.mark.parametrize(
@@ -228,95 +190,75 @@ def test_entries_of_other_seeds_and_other_scenes_of_the_same_names_are_passed_ov
         (lambda e: e["verification"].update(label="best"), "at verification/label"),
     ],
 )
-def test_every_edit_by_hand_is_named(
-    entered: Path, change: Any, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = entry_of(entered)
-    edit_json(path, change)
-    lines = problems(entered, capsys)
+def test_every_edit_by_hand_is_named(entered: Path, change: Any, message: str, problems: Any) -> None:
+    edit_json(entry_of(entered), change)
+    lines = problems(entered)
     assert any("tfp+4dgs.json" in line and message in line for line in lines)
     assert any("local.json: expected what the entries give" in line for line in lines), "its row is gone"
 
 
-def test_boards_follow_from_the_entries(entered: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = entry_of(entered)
+def test_boards_follow_from_the_entries(entered: Path, problems: Any) -> None:
     edit_json(entered / "board/local.json", lambda b: b["boards"][0]["rows"][0].update(rank=None))
-    (line,) = problems(entered, capsys)
+    (line,) = problems(entered)
     assert "local.json: expected what the entries give" in line
-    enter(entered)
-    moved = path.with_name("other.json")
-    path.rename(moved)
-    assert any("other.json: expected the entry of" in line for line in problems(entered, capsys))
-
-
-def test_a_forgery_that_agrees_with_itself_is_found_with_the_files(
-    entered: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """An entry edited together with its ledger line and its board: only scoring again finds it."""
-    path = entry_of(entered)
-    edit_with_ledger(path, lambda entry: raise_metric(entry["record"], "psnr", 1))
-    enter(entered, "bad", verified=False)  # writes the boards anew, and costs no scores
-    assert not problems(entered, capsys)
-    (line,) = problems(entered, capsys, **files(entered))
-    assert "tfp+4dgs.json, scene pattern-0" in line and "as computed from the files" in line
+    path = enter(entered)
+    path.rename(path.with_name("other.json"))
+    assert any("other.json: expected the entry of" in line for line in problems(entered))
 
 
 def edit_truth(**changes: Any) -> Any:
     return lambda entry: entry["verification"]["truth"]["pattern-0"].update(changes)
 
 
+def refitted(psnr: dict[str, float]) -> Any:
+    """State a second fit that reached these values."""
+    refit = {"psnr": psnr, "tolerance_db": 0.3, "bit_equal": False, "costs": {}, "apart": "process"}
+    return lambda entry: entry["verification"].update(label="re-fitted", refit=refit)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda e: raise_metric(e["record"], "psnr", 1), "scene pattern-0, .* as computed from the files"),
         (edit_truth(equal_pixels=0.0), r"scene pattern-0: expected equal_pixels 0\.\d+, as computed again, found 0\.0"),
         (lambda e: e["verification"].update(unverified=["psnr"]), "no unverified metric that these files give"),
         (edit_truth(equal_images=1), "expected equal_images 0, as computed again, found 1"),
         (lambda e: e["verification"]["truth"].pop("pattern-1"), "expected a check beside the truth of each scored"),
-        (
-            lambda e: e["verification"].update(label="re-fitted", refit=REFIT),
-            "expected a second fit of pattern-0, patt",
-        ),
-        (
-            lambda e: e["verification"].update(label="re-fitted", refit={**REFIT, "psnr": dict.fromkeys(SCENES, 90.0)}),
-            "found 90.00 dB",
-        ),
+        (refitted({"pattern-0": 20.0}), "expected a second fit of pattern-0, patt"),
+        (refitted({"pattern-0": 90.0, "pattern-1": 90.0}), "found 90.00 dB"),
     ],
 )
-def test_an_edited_verification_is_found_with_the_files(
-    entered: Path, capsys: pytest.CaptureFixture[str], change: Any, message: str
+def test_an_edit_that_agrees_with_itself_is_found_with_the_files(
+    entered: Path, problems: Any, change: Any, message: str
 ) -> None:
-    """Truth check or label edited together with the ledger: what was recomputed is compared."""
+    """Scores, truth check or label edited together with ledger and board: what was recomputed is compared."""
     edit_with_ledger(entry_of(entered), change)
     enter(entered, "bad", verified=False)  # writes the boards anew, and costs no scores
-    assert not problems(entered, capsys)
-    lines = problems(entered, capsys, **files(entered))
+    assert not problems(entered)
+    lines = problems(entered, **files_of(entered))
     assert len(lines) == 1 and "tfp+4dgs.json" in lines[0] and re.search(message, lines[0]), lines
     if read(entry_of(entered))["verification"]["label"] == "re-scored":  # what the line says to do
         enter(entered, replace=True)
-        assert not problems(entered, capsys, **files(entered))
+        assert not problems(entered, **files_of(entered))
         before = entry_of(entered).read_bytes()
         enter(entered, replace=True)
         assert entry_of(entered).read_bytes() == before, "the same check again changes nothing"
 
 
-REFIT = {"psnr": {"pattern-0": 20.0}, "tolerance_db": 0.3, "bit_equal": False, "costs": {}, "apart": "process"}
-SCENES = ("pattern-0", "pattern-1")
-
-
-def test_a_metric_whose_files_were_missing_is_no_edit(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_metric_whose_files_were_missing_is_no_edit(done: Path, problems: Any, said: Any) -> None:
     """As scenes come that were downloaded without their held-out streams."""
     streams = [(done / name / "spikes/cam_03.dat", done / f"{name}.dat") for name in ("s0", "s1")]
     for stream, away in streams:
         stream.rename(away)
     enter(done)
-    assert "(as claimed, not computed again: spike_psnr_5, " in capsys.readouterr().out
-    assert not problems(done, capsys, **files(done))
+    assert "(as claimed, not computed again: spike_psnr_5, " in said()
+    assert not problems(done, **files_of(done))
     for stream, away in streams:
         away.rename(stream)
-    (line,) = problems(done, capsys, **files(done))
+    (line,) = problems(done, **files_of(done))
     assert "expected no unverified metric that these files give, found spike_deviance, " in line
     enter(done)
-    assert not problems(done, capsys, **files(done))
+    assert not problems(done, **files_of(done))
 
 
 def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -329,7 +271,7 @@ def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.Mon
             return replace(check_truth(*args), noise_share=share, noise_share_error=0.01, ceiling_db=60.0)
 
         monkeypatch.setattr(verify, "check_truth", measured)
-        return verify.verify_leaderboard(entered / "board", **files(entered)).problems
+        return verify.verify_leaderboard(entered / "board", **files_of(entered)).problems
 
     assert not check(0.001)
     assert len(check(0.5)) == 2 and "expected noise_share 0.5, as computed again, found 0.0" in check(0.5)[1]
@@ -337,36 +279,33 @@ def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.Mon
 
 
 def test_a_label_that_a_second_fit_does_not_bear_out_is_found(
-    done: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
+    done: Path, installed: dict[str, Any], said: Any, problems: Any
 ) -> None:
     enter(done)
     enter(done, refit=True)
-    capsys.readouterr()
-    assert verify_leaderboard(done / "board", **files(done)) == 0
-    assert "1 scored again, 1 labelled re-fitted and not fitted again (--refit), no problems" in capsys.readouterr().out
-    assert verify_leaderboard(done / "board", **files(done), refit=True) == 0
+    said()
+    assert verify_leaderboard(done / "board", **files_of(done)) == 0
+    assert "1 scored again, 1 labelled re-fitted and not fitted again (--refit), no problems" in said()
+    assert verify_leaderboard(done / "board", **files_of(done), refit=True) == 0
     installed["tfp+4dgs"] = Darker("tfp+4dgs")
-    (line,) = problems(done, capsys, **files(done), refit=True)
+    (line,) = problems(done, **files_of(done), refit=True)
     assert "expected a second fit within 0.3 dB of the claimed" in line
 
 
 def test_the_second_fit_of_a_method_that_opens_the_held_out_stream_fails(
-    done: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
+    done: Path, installed: dict[str, Any], problems: Any
 ) -> None:
     installed["plays-back"] = PlaysBack()
     (record,) = run(done / "out", [done / "s0", done / "s1"], PlaysBack())
     claimed = {scene: cell["metrics"]["psnr"] for scene, cell in record["scenes"].items()}
-    refit = {**REFIT, "psnr": claimed}
-    edit_with_ledger(
-        enter(done, "plays-back"), lambda entry: entry["verification"].update(label="re-fitted", refit=refit)
-    )
+    edit_with_ledger(enter(done, "plays-back"), refitted(claimed))
     enter(done, "bad", verified=False)  # writes the boards anew
-    assert not problems(done, capsys, **files(done)), "its images are as claimed"
-    (line,) = problems(done, capsys, **files(done), refit=True)
+    assert not problems(done, **files_of(done)), "its images are as claimed"
+    (line,) = problems(done, **files_of(done), refit=True)
     assert "plays-back on pattern-0: expected a second fit that ends, found ValueError" in line
 
 
-def test_the_committed_leaderboard_has_no_problems(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_committed_leaderboard_has_no_problems_and_its_boards_follow_from_its_entries(said: Any) -> None:
     tracks.read_release.cache_clear()
     assert verify_leaderboard(Path(__file__).resolve().parents[2] / "leaderboard") == 0
-    assert "no problems" in capsys.readouterr().out
+    assert "no problems" in said()

@@ -45,6 +45,11 @@ def edit_with_ledger(path: Path, change: Any) -> None:
     add_line(board, sha256_json(json.loads(path.read_text())), path.relative_to(board).as_posix())
 
 
+def files_of(done: Path) -> dict[str, Any]:
+    """The options of a run's predictions and scenes."""
+    return {"predictions": done / "out/predictions", "scenes": (done / "s0", done / "s1")}
+
+
 def raise_metric(record: Record, metric: str, by: float) -> None:
     """Forge a record that agrees with itself: every image's value, and so all means, higher."""
     for cell in record["scenes"].values():
