@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from changes import edit_json
 from submissions import board, edit_with_ledger, enter, raise_metric, read, track, write_release
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.release.fingerprint import make_fingerprint, write_fingerprint
 from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.scene.manifest import write_manifest
@@ -21,7 +21,7 @@ from spike4dgs.leaderboard import tracks
 from spike4dgs.leaderboard.page.pictures import write_pictures
 from spike4dgs.leaderboard.page.rows import gather
 from spike4dgs.leaderboard.tracks import RELEASE, current_release, match_release, release_line, scene_name
-from spike4dgs.leaderboard.verify import verify_leaderboard
+from spike4dgs.leaderboard.verify import verify_leaderboard, verify_record
 
 SCENES = ("s0", "s1")
 
@@ -57,11 +57,11 @@ def ship(done: Path, monkeypatch: pytest.MonkeyPatch, share: float) -> Path:
 
 
 def test_a_result_of_equivalent_scenes_is_on_the_track_and_says_so(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    done: Path, monkeypatch: pytest.MonkeyPatch, said: Any
 ) -> None:
     data = ship(done, monkeypatch, 1e-4)
     entry = read(enter(done))
-    assert "rank 1 of 1 on patterns (release 2" in (said := capsys.readouterr().out)
+    assert "rank 1 of 1 on patterns (release 2" in (said := said())
     assert "on equivalent scenes (bits that differ: pattern-0 0.0" in said
     dataset = entry["record"]["dataset"]
     own, released = (open_scene(folder / "s0") for folder in (done, data))
@@ -118,9 +118,13 @@ def test_another_noise_is_on_a_local_board(done: Path, monkeypatch: pytest.Monke
     assert line is not None and "another scene, so on a local board: pattern-0 (" in line
 
 
+def claimed(data: Path) -> dict[str, Any]:
+    """What a record would state of s0, had it the released bits."""
+    return {"pattern-0": {"revision": open_scene(data / "s0").revision, "bits": 0.0}}
+
+
 def test_a_record_cannot_claim_it(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = ship(done, monkeypatch, 0.1)
-    claim = {"pattern-0": {"revision": open_scene(data / "s0").revision, "bits": 0.0}}
+    claim = claimed(ship(done, monkeypatch, 0.1))
     edit_json(done / "out/results/tfp+4dgs.json", lambda record: record["dataset"].update(equivalent=claim))
     for verified in (False, True):
         entry = read(enter(done, verified=verified, replace=True))
@@ -131,16 +135,11 @@ def test_a_record_cannot_claim_it(done: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_an_entry_that_claims_it_fails_when_its_scenes_are_compared(
     done: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = ship(done, monkeypatch, 0.1)
-    path = enter(done)
-    claim = {"pattern-0": {"revision": open_scene(data / "s0").revision, "bits": 0.0}}
-    entry = read_json(path, "an entry")
-    entry["record"]["dataset"]["equivalent"] = claim
-    from spike4dgs.leaderboard.verify import verify_record
-
+    claim, scenes = claimed(ship(done, monkeypatch, 0.1)), [open_scene(done / name) for name in SCENES]
+    record = read(path := enter(done))["record"]
+    record["dataset"]["equivalent"] = claim
     with pytest.raises(UserError, match="expected a scene that is equivalent to revision .*% of the spike bits differ"):
-        scenes = [open_scene(done / name) for name in SCENES]
-        verify_record(entry["record"], path, done / "out/predictions/tfp+4dgs", scenes)
+        verify_record(record, path, done / "out/predictions/tfp+4dgs", scenes)
 
 
 def test_a_fingerprint_that_was_exchanged_is_refused(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from changes import edit_json
 from dummy_methods import CountMethod, run
-from submissions import Record, board, enter, entry_of, read, release_of, submit
+from submissions import Record, board, enter, entry_of, read, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
@@ -40,12 +40,10 @@ def test_rows_are_ranked_and_failures_come_last(done: Path) -> None:
 def test_claimed_rows_have_no_rank_and_come_after_the_others(done: Path) -> None:
     enter(done, verified=False)
     enter(done, "rough")
-    rows = board(done)["boards"][0]["rows"]
-    assert rows[0]["mean"][PRIMARY] < rows[1]["mean"][PRIMARY]
-    assert [(r["method"], r["rank"], r["label"]) for r in rows] == [
-        ("rough", 1, "re-scored"),
-        ("tfp+4dgs", None, "claimed"),
-    ]
+    first, second = board(done)["boards"][0]["rows"]
+    assert first["mean"][PRIMARY] < second["mean"][PRIMARY]
+    assert (first["method"], first["rank"], first["label"]) == ("rough", 1, "re-scored")
+    assert (second["method"], second["rank"], second["label"]) == ("tfp+4dgs", None, "claimed")
 
 
 def test_costs_are_claimed_and_trained_on_is_shown(done: Path) -> None:
@@ -59,6 +57,11 @@ def test_costs_are_claimed_and_trained_on_is_shown(done: Path) -> None:
     assert row["costs"]["fit_seconds"] == {"claimed": pytest.approx(seconds), "re-fitted": None}
     assert row["trained_on"] == ["other-1-small"] and row["rank"] == 1
     assert row["given"] == ["poses", "flat-field"] and len(row["code"]["claimed"]) == len(row["code"]["verifier"]) == 1
+
+
+@pytest.fixture
+def record(finished: Path) -> Record:
+    return json.loads((finished / "out/results/rough.json").read_text())
 
 
 def entry_with(record: Record, name: str, psnr: float | None, submitted: str, seed: int = 0, **changes: Any) -> Record:
@@ -75,8 +78,7 @@ def ranks(entries: list[Record]) -> list[tuple[str, int | None, list[int], float
     return [(r["method"], r["rank"], r["seeds"], r["mean"][PRIMARY]) for r in rows]
 
 
-def test_of_equal_values_the_earlier_submission_is_first(finished: Path) -> None:
-    record = json.loads((finished / "out/results/rough.json").read_text())
+def test_of_equal_values_the_earlier_submission_is_first(record: Record) -> None:
     entries = [
         entry_with(record, "later", 20.0, "2026-01-02T00:00:00Z"),
         entry_with(record, "none", None, "2026-01-01T00:00:00Z"),
@@ -86,21 +88,16 @@ def test_of_equal_values_the_earlier_submission_is_first(finished: Path) -> None
     assert [r[:2] for r in ranks(entries)] == [("best", 1), ("earlier", 2), ("later", 3), ("none", None)]
 
 
-def test_a_row_is_the_mean_over_the_seeds_of_one_configuration(finished: Path) -> None:
-    record = json.loads((finished / "out/results/rough.json").read_text())
+def test_a_row_is_the_mean_over_the_seeds_of_one_configuration(record: Record) -> None:
     entries = [entry_with(record, "a", 20.0 + seed, "2026-01-02T00:00:00Z", seed) for seed in range(3)]
     other = entry_with(record, "a", 50.0, "2026-01-02T00:00:00Z", 3, params={"steps": 9})
     claimed = entry_with(record, "a", 90.0, "2026-01-02T00:00:00Z", 4)
     claimed["verification"] = {"label": "claimed", "unverified": [], "by": None, "truth": {}, "refit": None}
-    assert ranks([*entries, other, claimed]) == [
-        ("a", 1, [3], 50.0),
-        ("a", 2, [0, 1, 2], 21.0),
-        ("a", None, [4], 90.0),
-    ]
+    expected = [("a", 1, [3], 50.0), ("a", 2, [0, 1, 2], 21.0), ("a", None, [4], 90.0)]
+    assert ranks([*entries, other, claimed]) == expected
 
 
-def test_refined_scores_have_no_rank_and_say_so(done: Path) -> None:
-    record = json.loads((done / "out/results/rough.json").read_text())
+def test_refined_scores_have_no_rank_and_say_so(record: Record) -> None:
     names = {"rough.refined": 30.0, "rough": 20.0}
     entries = {
         f"entries/a@0/{n}.json": entry_with(record, n, psnr, "2026-01-01T00:00:00Z") for n, psnr in names.items()
@@ -110,9 +107,8 @@ def test_refined_scores_have_no_rank_and_say_so(done: Path) -> None:
     assert (refined["method"], refined["rank"], reason(refined)) == ("rough.refined", None, REFINED)
 
 
-def test_seeds_join_only_with_equal_code_parameters_and_verification(finished: Path) -> None:
+def test_seeds_join_only_with_equal_code_parameters_and_verification(record: Record) -> None:
     """Gray images under another method's name are a row of their own, whatever they leave equal."""
-    record = json.loads((finished / "out/results/rough.json").read_text())
 
     def of(seed: int, change: Any) -> Record:
         found = entry_with(record, "a", 40.0 - 20 * (seed > 0), "2026-01-02T00:00:00Z", seed)
@@ -159,7 +155,7 @@ def test_a_forged_seed_joins_re_scored_ones_and_never_re_fitted_ones(done: Path,
     assert rows[0]["mean"] == json.loads((done / "out/results/tfp+4dgs.json").read_text())["mean"]
 
 
-def test_a_method_with_one_failed_scene_is_not_ranked(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_method_with_one_failed_scene_is_not_ranked(done: Path, said: Any) -> None:
     class Half(CountMethod):
         def fit(self, scene: Any, *args: Any, **kwargs: Any) -> Any:
             if scene.id == "pattern-1":
@@ -171,7 +167,7 @@ def test_a_method_with_one_failed_scene_is_not_ranked(done: Path, capsys: pytest
     assert entry["verification"]["label"] == "re-scored", "what was scored was verified"
     (row,) = board(done)["boards"][0]["rows"]
     assert row["rank"] is None and row["status"] == {"pattern-0": "ok", "pattern-1": "failed"}
-    assert "not ranked (pattern-1 failed)" in capsys.readouterr().out
+    assert "not ranked (pattern-1 failed)" in said()
 
 
 def test_only_records_of_one_dataset_compare(entered: Path) -> None:
@@ -181,23 +177,17 @@ def test_only_records_of_one_dataset_compare(entered: Path) -> None:
     assert sorted(names) == [("pattern-0+pattern-1", ["tfp+4dgs"]), ("pattern-1", ["other"])]
 
 
-def test_methods_are_on_the_tracks_that_withhold_nothing_they_are_given(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_methods_are_on_the_tracks_that_withhold_nothing_they_are_given(done: Path, released: None, said: Any) -> None:
     class Unposed(CountMethod):
         given = ("flat-field",)
 
-    release_of(done, monkeypatch)
     run(done / "out", [done / "s0", done / "s1"], Unposed("unposed"))
     enter(done)
     enter(done, "unposed")
-    boards = {b["track"]: [(r["method"], r["rank"]) for r in b["rows"]] for b in board(done, "leaderboard")["boards"]}
-    assert {track: {m for m, _ in rows} for track, rows in boards.items()} == {
-        "patterns": {"tfp+4dgs", "unposed"},
-        "unposed": {"unposed"},
-    }
-    assert boards["unposed"] == [("unposed", 1)] and not (done / "board/local.json").exists()
-    out = capsys.readouterr().out
+    boards = {b["track"]: {r["method"]: r["rank"] for r in b["rows"]} for b in board(done, "leaderboard")["boards"]}
+    assert boards.keys() == {"patterns", "unposed"} and boards["patterns"].keys() == {"tfp+4dgs", "unposed"}
+    assert boards["unposed"] == {"unposed": 1} and not (done / "board/local.json").exists()
+    out = said()
     revision = board(done, "leaderboard")["boards"][0]["revision"][:12]
     assert f"on patterns (release 2, revision {revision})" in out
     assert f"rank 1 of 1 on unposed (release 2, revision {revision})" in out
@@ -227,30 +217,14 @@ def test_the_archive_is_kept_and_has_no_ranks(entered: Path) -> None:
     assert [(r["rank"], r["entries"]) for r in only["rows"]] == [(None, [name])]
 
 
-def test_the_committed_boards_follow_from_the_committed_entries(tmp_path: Path) -> None:
-    committed = Path(__file__).resolve().parents[2] / "leaderboard"
-    for name in ("entries", "archive"):
-        if (committed / name).is_dir():
-            shutil.copytree(committed / name, tmp_path / name)
-    shutil.copy(committed / "LEDGER", tmp_path)
-    boards = write_boards(tmp_path)
-    assert boards["entries"]["boards"] and not any(b["refused"] for b in boards.values())
-    for name in ("leaderboard.json", "archive.json"):
-        assert (tmp_path / name).is_file() == (committed / name).is_file()
-        assert not (tmp_path / name).is_file() or (tmp_path / name).read_bytes() == (committed / name).read_bytes()
-
-
-CHECK = {"images": 3, "equal_images": 0, "equal_pixels": 0.04, "ceiling_db": None}
-
-
-def entry(finished: Path, truth: dict[str, Any] | None = None, **method: Any) -> dict[str, Any]:
-    record = copy.deepcopy(json.loads((finished / "out/results/rough.json").read_text()))
+def entry(record: Record, truth: dict[str, Any] | None = None, **method: Any) -> dict[str, Any]:
     record["method"].update(method)
     return {"record": record, "verification": {"truth": {"pattern-0": truth} if truth else {}}}
 
 
 def check(share: float | None = None, error: float | None = None, **changes: Any) -> dict[str, Any]:
-    return {**CHECK, "noise_share": share, "noise_share_error": error, **changes}
+    plain = {"images": 3, "equal_images": 0, "equal_pixels": 0.04, "ceiling_db": None}
+    return {**plain, "noise_share": share, "noise_share_error": error, **changes}
 
 
 @pytest.mark.parametrize(
@@ -265,14 +239,14 @@ def check(share: float | None = None, error: float | None = None, **changes: Any
         (("data/pattern-0/",), True),
     ],
 )
-def test_trained_on_is_checked_against_scene_ids(finished: Path, trained_on: tuple[str, ...], flagged: bool) -> None:
+def test_trained_on_is_checked_against_scene_ids(record: Record, trained_on: tuple[str, ...], flagged: bool) -> None:
     expected = ["trained on test scenes (pattern-0)"] if flagged else []
-    assert flags_of(entry(finished, trained_on=[*trained_on])) == expected
+    assert flags_of(entry(record, trained_on=[*trained_on])) == expected
 
 
-def test_trained_on_is_checked_against_revisions(finished: Path) -> None:
-    revision = entry(finished)["record"]["dataset"]["scenes"]["pattern-1"]
-    assert flags_of(entry(finished, trained_on=[f"sha256:{revision}"])) == ["trained on test scenes (pattern-1)"]
+def test_trained_on_is_checked_against_revisions(record: Record) -> None:
+    revision = record["dataset"]["scenes"]["pattern-1"]
+    assert flags_of(entry(record, trained_on=[f"sha256:{revision}"])) == ["trained on test scenes (pattern-1)"]
 
 
 @pytest.mark.parametrize(
@@ -288,17 +262,17 @@ def test_trained_on_is_checked_against_revisions(finished: Path) -> None:
         (check(ceiling_db=200.0), None),
     ],
 )
-def test_flags_follow_from_what_was_measured(finished: Path, truth: dict[str, Any], flag: str | None) -> None:
-    assert flags_of(entry(finished, truth)) == ([flag] if flag else [])
+def test_flags_follow_from_what_was_measured(record: Record, truth: dict[str, Any], flag: str | None) -> None:
+    assert flags_of(entry(record, truth)) == ([flag] if flag else [])
 
 
-def test_no_score_is_above_the_ceiling_or_as_near_to_it_as_another_rendering(finished: Path) -> None:
-    psnr = entry(finished)["record"]["scenes"]["pattern-0"]["metrics"]["psnr"]
+def test_no_score_is_above_the_ceiling_or_as_near_to_it_as_another_rendering(record: Record) -> None:
+    psnr = record["scenes"]["pattern-0"]["metrics"]["psnr"]
     as_many_samples = psnr + 10 * math.log10(1 + 1)  # the ceiling of what scores like a second rendering
-    assert not flags_of(entry(finished, check(ceiling_db=as_many_samples + 1)))
+    assert not flags_of(entry(record, check(ceiling_db=as_many_samples + 1)))
     for ceiling in (as_many_samples, psnr):
-        (flag,) = flags_of(entry(finished, check(ceiling_db=ceiling)))
+        (flag,) = flags_of(entry(record, check(ceiling_db=ceiling)))
         noted = f"(pattern-0 has {psnr:.1f} of {ceiling:.1f} dB)"
         assert flag == f"as near to the truth as another rendering {noted}"
-    (flag,) = flags_of(entry(finished, check(ceiling_db=psnr - 0.2)))
+    (flag,) = flags_of(entry(record, check(ceiling_db=psnr - 0.2)))
     assert flag == f"above the noise ceiling (pattern-0 has {psnr:.1f} of {psnr - 0.2:.1f} dB)"

@@ -17,10 +17,7 @@ from spike4dgs.benchmark.files import sha256_json, write_bytes
 from spike4dgs.cli.submit import submit_all
 
 
-def test_with_files_an_entry_is_re_scored(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    release_of(done, monkeypatch)
+def test_with_files_an_entry_is_re_scored(done: Path, released: None, said: Any) -> None:
     path = enter(done)
     entry = read(path)
     assert entry["verification"]["label"] == "re-scored"
@@ -29,20 +26,20 @@ def test_with_files_an_entry_is_re_scored(
     revision = board(done, "leaderboard")["boards"][0]["revision"][:12]
     assert path.parent == done / f"board/entries/2-patterns@{revision}"
     line = f"tfp+4dgs: re-scored, rank 1 of 1 on patterns (release 2, revision {revision})\n"
-    assert capsys.readouterr().out == line
+    assert said() == line
 
 
 def test_another_revision_is_local_says_why_and_leaves_the_track_alone(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    done: Path, monkeypatch: pytest.MonkeyPatch, said: Any
 ) -> None:
     release_of(done, monkeypatch)
     enter(done)
     public = files_in(done / "board/entries")
     release_of(done, monkeypatch, pattern_0="cd" * 32)
     edit_json(done / "out/results/tfp+4dgs.json", lambda r: r["dataset"]["scenes"].update({"pattern-0": "ab" * 32}))
-    capsys.readouterr()
+    said()
     assert submit(done / "out/results/tfp+4dgs.json", leaderboard=done / "board", replace=True) == 0
-    out = capsys.readouterr().out
+    out = said()
     assert f"pattern-0: revision {'ab' * 6} here, {'cd' * 6} in release 2" in out
     assert f"local board, in {done}/board/local.json, not on a track: local/pattern-0+1@" in out
     assert files_in(done / "board/entries") == public, "the track's entry is as it was"
@@ -51,22 +48,21 @@ def test_another_revision_is_local_says_why_and_leaves_the_track_alone(
 
 
 @pytest.mark.parametrize(
-    ("given", "reason"),
+    ("predictions", "scenes", "reason"),
     [
-        ((), "no --predictions"),
-        (("scenes",), "no --predictions"),
-        (("predictions",), "no --scenes for pattern-0, pattern-1"),
-        (("predictions", "one"), "no --scenes for pattern-1"),
+        (None, (), "no --predictions"),
+        (None, ("s0", "s1"), "no --predictions"),
+        ("tfp+4dgs", (), "no --scenes for pattern-0, pattern-1"),
+        ("tfp+4dgs", ("s0",), "no --scenes for pattern-1"),
     ],
 )
 def test_without_files_an_entry_is_claimed(
-    done: Path, given: tuple[str, ...], reason: str, capsys: pytest.CaptureFixture[str]
+    done: Path, predictions: str | None, scenes: tuple[str, ...], reason: str, said: Any
 ) -> None:
-    options: dict[str, Any] = {"predictions": done / "out/predictions/tfp+4dgs"} if "predictions" in given else {}
-    options |= {"scenes": (done / "s0", done / "s1")} if "scenes" in given else {}
-    options |= {"scenes": (done / "s0",)} if "one" in given else {}
+    folder = done / "out/predictions" / predictions if predictions else None
+    options = {"predictions": folder, "scenes": tuple(done / name for name in scenes)}
     assert read(enter(done, verified=False, **options))["verification"]["label"] == "claimed"
-    assert f"claimed ({reason}), not ranked (nothing was computed again) on the local" in capsys.readouterr().out
+    assert f"claimed ({reason}), not ranked (nothing was computed again) on the local" in said()
 
 
 def test_submitting_twice_changes_nothing_and_neither_does_scoring_again(entered: Path) -> None:
@@ -99,17 +95,11 @@ def test_another_record_needs_replace(entered: Path) -> None:
 
 def test_seeds_are_entries_of_one_row(entered: Path) -> None:
     run(entered / "other", [entered / "s0", entered / "s1"], CountMethod("tfp+4dgs"), seed=5)
-    seeded = entered / "other/results/tfp+4dgs.json"
-    submit_all(
-        {seeded: entered / "other/predictions/tfp+4dgs"},
-        scenes=(entered / "s0", entered / "s1"),
-        leaderboard=entered / "board",
-    )
+    seeded, scenes = entered / "other/results/tfp+4dgs.json", (entered / "s0", entered / "s1")
+    submit_all({seeded: entered / "other/predictions/tfp+4dgs"}, scenes=scenes, leaderboard=entered / "board")
     (row,) = board(entered)["boards"][0]["rows"]
-    assert row["seeds"] == [0, 5] and [p.rpartition("/")[2] for p in row["entries"]] == [
-        "tfp+4dgs.json",
-        "tfp+4dgs@seed-5.json",
-    ]
+    assert row["seeds"] == [0, 5]
+    assert [p.rpartition("/")[2] for p in row["entries"]] == ["tfp+4dgs.json", "tfp+4dgs@seed-5.json"]
     each = [json.loads(p.read_text())["mean"]["psnr"] for p in (seeded, entered / "out/results/tfp+4dgs.json")]
     assert row["mean"]["psnr"] == pytest.approx(sum(each) / 2)
 
@@ -124,6 +114,7 @@ def test_a_refused_record_does_not_stop_the_others(done: Path, capsys: pytest.Ca
 
 
 def test_a_folder_that_is_no_leaderboard_is_refused(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert inspect.signature(submit).parameters["leaderboard"].default == Path("leaderboard")
     for name in ("site/index.html", "site/archive/2024/photo.webp"):
         write_bytes(done / name, b"theirs")
     before = files_in(done)
@@ -140,12 +131,8 @@ def test_a_folder_that_is_no_leaderboard_is_refused(done: Path, monkeypatch: pyt
     assert files_in(done) == before
 
 
-def test_the_default_folder_is_the_repositorys() -> None:
-    assert inspect.signature(submit).parameters["leaderboard"].default == Path("leaderboard")
-
-
 def test_a_second_fit_is_compared_and_its_costs_stand_beside_the_claimed_ones(
-    entered: Path, installed: dict[str, Any], capsys: pytest.CaptureFixture[str]
+    entered: Path, installed: dict[str, Any], said: Any
 ) -> None:
     submitted = read(entry_of(entered))["submitted"]
     entry = read(enter(entered, refit=True))
@@ -154,12 +141,9 @@ def test_a_second_fit_is_compared_and_its_costs_stand_beside_the_claimed_ones(
     assert (entry["verification"]["label"], entry["submitted"]) == ("re-fitted", submitted)
     assert refit["psnr"] == pytest.approx(claimed) and refit["bit_equal"] is True and refit["apart"] == "process"
     (row,) = board(entered)["boards"][0]["rows"]
-    costs = row["costs"]["fit_seconds"]
-    assert row["label"] == "re-fitted" and costs["re-fitted"] == pytest.approx(
-        sum(c["fit_seconds"] for c in refit["costs"].values())
-    )
-    assert costs["claimed"] != costs["re-fitted"]
-    assert "tfp+4dgs: re-fitted, rank 1 of 1" in capsys.readouterr().out
+    costs, seconds = row["costs"]["fit_seconds"], sum(c["fit_seconds"] for c in refit["costs"].values())
+    assert row["label"] == "re-fitted" and costs["re-fitted"] == pytest.approx(seconds) != costs["claimed"]
+    assert "tfp+4dgs: re-fitted, rank 1 of 1" in said()
     assert [path.name for path in (entered / "board/.refit").iterdir()] == [".made-by"]
 
 
