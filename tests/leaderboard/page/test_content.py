@@ -99,6 +99,8 @@ def test_rows_are_compared_where_every_image_has_a_score() -> None:
     assert scores.left_out == {2: "s failed", 3: "nothing was computed again", 4: "no PSNR of 1 images"}
     comparison = compare_rows(scores, "psnr")
     assert comparison is not None and comparison.means.tolist() == [30.5, 20.5]
+    nothing = image_scores(board("b", rows), "flip")
+    assert not nothing.values and compare_rows(nothing, "flip") is None
 
 
 def test_images_without_a_score_in_any_row_have_no_part() -> None:
@@ -108,11 +110,6 @@ def test_images_without_a_score_in_any_row_have_no_part() -> None:
         r.first["scenes"]["s"]["per_image"]["cam_03/000000"]["temporal_error"] = None
     scores = image_scores(board("b", rows), "temporal_error")
     assert scores.images == [["cam_03/000020", "cam_03/000040"]] and len(scores.values) == 2
-
-
-def test_a_metric_that_nobody_has_compares_nothing() -> None:
-    scores = image_scores(board("b", [row("a", {"s": cell({"psnr": np.ones(2)})})]), "flip")
-    assert not scores.values and compare_rows(scores, "flip") is None
 
 
 def test_numbers_keep_seven_digits() -> None:

@@ -11,17 +11,7 @@ import pytest
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.leaderboard.page import intervals, pair_kernels
-from spike4dgs.leaderboard.page.intervals import (
-    GRID,
-    LEVEL,
-    MOST_UNITS,
-    compare,
-    draw_weights,
-    hashed,
-    pair_statistics,
-    resampled_means,
-    widened_values,
-)
+from spike4dgs.leaderboard.page.intervals import GRID, LEVEL, MOST_UNITS, compare, draw_weights, resampled_means
 
 
 def scored(values: Float64) -> list[list[Float64]]:
@@ -48,10 +38,8 @@ def test_tiny_cases_against_all_resamples() -> None:
     ]
     draws = resampled_means(scored(values[None]), True, replicates=40_000)[:, 0]
     assert draws.std() == pytest.approx(np.std(exact), rel=0.02)
-    for q in (0.05, 0.25, 0.5, 0.75, 0.95):
-        assert np.mean(draws <= np.quantile(exact, q)) == pytest.approx(
-            np.mean(exact <= np.quantile(exact, q)), abs=0.01
-        )
+    for q in np.quantile(exact, (0.05, 0.25, 0.5, 0.75, 0.95)):
+        assert np.mean(draws <= q) == pytest.approx(np.mean(exact <= q), abs=0.01)
 
 
 def test_seeds_add_their_variance() -> None:
@@ -79,25 +67,20 @@ def test_lower_is_better_turns_the_ranks_around() -> None:
     assert compare(scored(values), False).best_ranks.tolist() == [1, 2, 3]
 
 
-def test_a_method_alone_has_rank_one() -> None:
+def test_critical_values_are_widened_to_students() -> None:
+    at = dict(zip(GRID.round(9), intervals.widened_values(5), strict=True))
+    assert at[2.0] == pytest.approx(math.sqrt(5 / 4) * 2.8693, rel=1e-3)  # t of 4 degrees with the tail 0.02275
+    assert np.abs(intervals.widened_values(MOST_UNITS) / GRID - 1).max() < 0.25
+
+
+def test_of_a_single_image_nothing_is_told_and_a_method_alone_has_rank_one() -> None:
+    found = compare(scored(np.array([[[1.0]], [[2.0]]])), True)
+    assert found.best_ranks.tolist() == [1, 1] and found.worst_ranks.tolist() == [2, 2]
     found = compare(scored(np.ones((1, 2, 3))), True)
     assert found.best_ranks.tolist() == found.worst_ranks.tolist() == [1]
 
 
-def test_critical_values_are_widened_to_students() -> None:
-    at = dict(zip(GRID.round(9), widened_values(5), strict=True))
-    assert at[2.0] == pytest.approx(math.sqrt(5 / 4) * 2.8693, rel=1e-3)  # t of 4 degrees with the tail 0.02275
-    assert np.abs(widened_values(MOST_UNITS) / GRID - 1).max() < 0.25
-
-
-def test_of_a_single_image_nothing_is_told() -> None:
-    found = compare(scored(np.array([[[1.0]], [[2.0]]])), True)
-    assert found.best_ranks.tolist() == [1, 1] and found.worst_ranks.tolist() == [2, 2]
-
-
-@pytest.mark.parametrize(
-    "effects", [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 1.0, 1.0, 0.5, 0.0, 0.0)], ids=["equal", "some"]
-)
+@pytest.mark.parametrize("effects", [(0.0,) * 6, (2.0, 1.0, 1.0, 0.5, 0.0, 0.0)], ids=["equal", "some"])
 @pytest.mark.parametrize("n_scenes", [5, 12])
 def test_intervals_cover_known_ranks(effects: tuple[float, ...], n_scenes: int) -> None:
     """Methods differ by known effects, scenes and images add noise; the true ranks are in the intervals as promised."""
@@ -130,7 +113,7 @@ def lowbias32(x: int) -> int:
 
 def test_the_hash_is_the_published_one() -> None:
     counters = np.array([0, 1, 2, 77, 2**31, 2**32 - 1], np.uint32)
-    assert hashed(counters, 9).tolist() == [lowbias32(int(c) ^ lowbias32(9)) for c in counters]
+    assert intervals.hashed(counters, 9).tolist() == [lowbias32(int(c) ^ lowbias32(9)) for c in counters]
 
 
 def test_a_replicate_is_what_a_loop_draws() -> None:
@@ -180,7 +163,7 @@ def test_the_compiled_pairs_are_those_of_numpy(methods: int) -> None:
     deviations[:, -1] = deviations[:, 0]  # no error
     deviations[:, methods // 2] = deviations[:, 0] + 1e-9 * deviations[:, 1]
     errors, largest = pair_kernels.pair_statistics(deviations)
-    expected_errors, expected_largest = pair_statistics(deviations)
+    expected_errors, expected_largest = intervals.pair_statistics(deviations)
     np.testing.assert_allclose(errors, expected_errors, rtol=1e-14)
     np.testing.assert_allclose(largest, expected_largest, rtol=1e-14)
 

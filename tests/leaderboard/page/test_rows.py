@@ -20,14 +20,11 @@ COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 
 
 def test_the_committed_entries_are_all_there(committed: list[Board]) -> None:
-    boards = committed
     for folder, name in ((PUBLIC, "entries"), (ARCHIVE, "archive")):
-        rows = [r for b in boards if b.folder == folder for r in b.rows]
-        assert {path for r in rows for path in r.entries} == {
-            p.relative_to(COMMITTED).as_posix() for p in (COMMITTED / name).glob("*/*.json")
-        }
-    assert not any(r.ranked for b in boards if b.folder == ARCHIVE for r in b.rows)
-    assert len(set(titles(boards))) == len(boards)
+        found = {path for b in committed if b.folder == folder for r in b.rows for path in r.entries}
+        assert found == {p.relative_to(COMMITTED).as_posix() for p in (COMMITTED / name).glob("*/*.json")}
+    assert not any(r.ranked for b in committed if b.folder == ARCHIVE for r in b.rows)
+    assert len(set(titles(committed))) == len(committed)
 
 
 def test_a_run_alone_makes_a_board_of_its_own(finished: Path, tmp_path: Path) -> None:
@@ -96,11 +93,8 @@ def test_rows_and_boards_of_one_name_are_told_apart(done: Path) -> None:
     assert [find_board(boards, title) for title in titles(boards)] == boards
 
 
-def test_a_folder_without_records_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_records_and_an_unknown_track_are_refused(tmp_path: Path, committed: list[Board]) -> None:
     with pytest.raises(UserError, match="results/"):
         gather(tmp_path / "none", (tmp_path,))
-
-
-def test_an_unknown_track_is_refused(committed: list[Board]) -> None:
     with pytest.raises(UserError, match="ideal"):
         find_board(committed, "indoor")

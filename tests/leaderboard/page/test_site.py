@@ -39,10 +39,6 @@ def test_a_page_is_replaced_and_equal_boards_give_equal_bytes(tmp_path: Path) ->
     write_site(out, small())
     write_site(tmp_path / "again", small())
     assert files_in(out) == files_in(tmp_path / "again")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other/mine.txt").touch()
-    with pytest.raises(UserError, match="an earlier page"):
-        write_site(tmp_path / "other", small())
 
 
 @pytest.mark.parametrize("after", [0, 1, 2, 7, 20])
