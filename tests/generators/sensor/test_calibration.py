@@ -112,11 +112,7 @@ def scene_with_recordings(root, facts):
     return write_small_scene(root, extras={"calibration": facts})
 
 
-FACTS = {
-    "flat_radiance": calibration.FLAT_RADIANCE,
-    "flat_ticks": calibration.FLAT_TICKS,
-    "dark_ticks": calibration.DARK_TICKS,
-}
+FACTS = {key.lower(): getattr(calibration, key) for key in ("FLAT_RADIANCE", "FLAT_TICKS", "DARK_TICKS")}
 
 
 def test_the_command_writes_maps_and_images_and_scores_them(tmp_path, capsys):

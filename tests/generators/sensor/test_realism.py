@@ -77,12 +77,9 @@ def real_sensor(photons: float | None = SENSOR.photons_per_spike) -> Sensor:
 
 def record(light: np.ndarray, sensor: Sensor, ticks: int = TICKS) -> np.ndarray:
     """Return unpacked spikes [T, H, W] of a static scene."""
-    height, width = light.shape
-    packed = np.concatenate(
-        list(simulate([light, light], [0, ticks], ticks, sensor, random_charge(height, width, [0])))
-    )
-    bits = np.unpackbits(packed, axis=1, bitorder="little")[:, : height * width]
-    return bits.reshape(ticks, height, width)[:, ::-1].astype(bool)
+    packed = [*simulate([light, light], [0, ticks], ticks, sensor, random_charge(*light.shape, [0]))]
+    bits = np.unpackbits(np.concatenate(packed), axis=1, bitorder="little")[:, : light.size]
+    return bits.reshape(ticks, *light.shape)[:, ::-1].astype(bool)
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +117,12 @@ def test_wrong_cameras_are_distinguished(roadside):
 def test_maps_have_the_published_spreads():
     sensor = real_sensor()
     assert sensor.gain.mean() == pytest.approx(1, abs=1e-6)
-    assert sensor.gain.std() == pytest.approx(GAIN_SPREAD, rel=WITHIN)
+    assert sensor.gain.std() == pytest.approx(GAIN_SPREAD, abs=0.002)
     assert local_spread(sensor.gain) == pytest.approx(GAIN_LOCAL, rel=WITHIN)
-    assert np.percentile(sensor.dark, (1, 50, 99)) == pytest.approx(DARK_PERCENTILES, rel=WITHIN)
+    smooth = sensor.gain.reshape(25, 10, 40, 10).mean((1, 3), keepdims=True)  # of blocks, another measure of it
+    assert (sensor.gain.reshape(25, 10, 40, 10) / smooth).std() == pytest.approx(GAIN_LOCAL, rel=WITHIN)
+    assert np.percentile(sensor.dark, (1, 50, 99)) == pytest.approx(DARK_PERCENTILES, rel=0.1)
+    assert np.median(sensor.dark) == pytest.approx(DARK_PERCENTILES[1], rel=0.02)
     assert (sensor.dark > 5 * np.median(sensor.dark)).sum() == pytest.approx(HOT, rel=WITHIN)
 
 
@@ -130,11 +130,9 @@ def test_a_definition_of_excess_variance_against_its_closed_form():
     """Counts of an ideal pixel are one of two neighbours; the rest is the estimate's own f (1 - f) / (n - 1)."""
     rate, window, n = 0.237, 20, 25
     level = np.random.default_rng(0).random(4000)
-    spikes = np.floor(level + rate * np.arange(1, n * window + 1)[:, None]) - np.floor(
-        level + rate * np.arange(n * window)[:, None]
-    )
+    spikes = np.diff(np.floor(level + rate * np.arange(n * window + 1)[:, None]), axis=0).astype(bool)
     f = (rate * window) % 1
-    assert excess_variance(spikes.astype(bool), window) == pytest.approx(f * (1 - f) / (n - 1), rel=0.05)
+    assert excess_variance(spikes, window) == pytest.approx(f * (1 - f) / (n - 1), rel=0.05)
 
 
 def test_static_pixels_of_a_real_recording_and_of_a_simulation_at_their_rates():
@@ -166,9 +164,8 @@ def test_measured_maps_and_ours_have_the_same_spread():
     # `dark` is in lux, and the interval less one is inversely proportional to the light, which was 335 lux at `light`
     rate = 1 / (1 + light * (335 + dark) / dark)
     assert np.percentile(sensor.dark, (1, 50, 99)) == pytest.approx(np.percentile(rate, (1, 50, 99)), rel=WITHIN)
-    assert (sensor.dark > 5 * np.median(sensor.dark)).sum() == pytest.approx(
-        (dark > 5 * np.median(dark)).sum(), rel=WITHIN
-    )
+    ours, theirs = ((rates > 5 * np.median(rates)).sum() for rates in (sensor.dark, dark))
+    assert ours == pytest.approx(theirs, rel=WITHIN)
 
 
 def robust_spread(image: np.ndarray) -> float:

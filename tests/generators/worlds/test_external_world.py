@@ -17,7 +17,6 @@ from packages import install
 
 from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.cli import main
 from spike4dgs.generators.worlds import HARD, OURS, World, Worlds
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -103,13 +102,3 @@ def test_what_cannot_be_used_is_one_error(monkeypatch: pytest.MonkeyPatch, name:
     with pytest.raises(UserError) as e:
         list(Worlds())
     assert message in str(e.value)
-
-
-def test_the_commands_say_so_too(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    entry = Registered("clash", "their:WORLDS", "spike4dgs.worlds")
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
-    monkeypatch.setattr("spike4dgs.generators.worlds.WORLDS", Worlds())
-    assert main(["make-dataset", "moon", "--profile", "tiny", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.startswith("error: entry point clash: expected a new world name")

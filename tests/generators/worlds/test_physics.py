@@ -11,15 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from spike4dgs.generators.worlds import WorldScene, bricks, chips
 from spike4dgs.generators.worlds.meshes import box
-from spike4dgs.generators.worlds.parts.rigid_bodies import (
-    GRAVITY_M_S2,
-    SOFT_M,
-    STEP_S,
-    Block,
-    Body,
-    Trajectory,
-    simulate,
-)
+from spike4dgs.generators.worlds.parts import rigid_bodies
+from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2, SOFT_M, STEP_S, Body, Trajectory, simulate
 from spike4dgs.generators.worlds.textures import _font
 
 MODULES = {"bricks": bricks, "chips": chips}
@@ -72,9 +65,6 @@ def energy(bodies: list[Body], path: Trajectory) -> np.ndarray:
     return (moving + mass * GRAVITY_M_S2 * path.positions[1:, :, 2]).sum(1)
 
 
-# ---------------------------------------------------------------- conserved quantities
-
-
 @pytest.mark.parametrize(("name", "variant"), CASES)
 def test_energy_falls_except_for_what_contacts_return(name, variant):
     _, bodies, path = simulated(name, variant)
@@ -105,10 +95,8 @@ def test_chips_that_collide_in_the_air_keep_momentum_and_angular_momentum():
     bodies = []
     for k in range(12):  # thrown at each other from a circle
         a = 2 * np.pi * k / 12
-        position, velocity = (
-            (0.12 * np.cos(a), 0.12 * np.sin(a), 1.0),
-            (-3 * np.cos(a), -3 * np.sin(a), rng.normal(0, 0.1)),
-        )
+        position = (0.12 * np.cos(a), 0.12 * np.sin(a), 1.0)
+        velocity = (-3 * np.cos(a), -3 * np.sin(a), rng.normal(0, 0.1))
         q, spin = rng.normal(size=4), tuple(rng.normal(0, 22, 3).tolist())
         turn = tuple((q / np.linalg.norm(q)).tolist())
         bodies.append(Body("cylinder", (0.024, 0.00225), position, turn, velocity, spin, 1800.0))
@@ -145,9 +133,6 @@ def test_spin_is_given_in_world_coordinates():
         np.testing.assert_allclose(spin, [b.spin for b in bodies], atol=0.2)  # a step of precession
 
 
-# ---------------------------------------------------------------- solid bodies
-
-
 def local_points(path: Trajectory, t_s: float, points: np.ndarray) -> np.ndarray:
     """Return world points [B, P, 3], P for each body, in every body's coordinates: [B, B, P, 3] (seen by, owned by)."""
     turn, position = path.at(t_s)
@@ -160,11 +145,12 @@ def test_bodies_stay_rigid_and_do_not_enter_each_other_or_the_table(name, varian
     (surface,) = world.deforming.values()
     count = len(bodies) - len(world.instances)
     assert surface.bodies.max() == count - 1
+    own = Trajectory(path.start_s, path.positions[:, :count], path.quaternions[:, :count])
     others, every, shape = ~np.eye(count, dtype=bool), np.arange(count), None
     for t in np.linspace(0, 0.1, 41):
         points = surface.vertices(t).reshape(count, -1, 3)
         assert points[..., 2].min() > -SOFT_M
-        seen = local_points(Trajectory(path.start_s, *_first(path, count)), t, points)
+        seen = local_points(own, t, points)
         shape = seen[every, every] if shape is None else shape
         np.testing.assert_allclose(seen[every, every], shape, atol=1e-9)
         seen = np.abs(seen)
@@ -176,14 +162,11 @@ def test_bodies_stay_rigid_and_do_not_enter_each_other_or_the_table(name, varian
         assert depth[others].max() < SOFT_M
 
 
-def _first(path: Trajectory, count: int) -> tuple[np.ndarray, np.ndarray]:
-    return path.positions[:, :count], path.quaternions[:, :count]
-
-
 @pytest.mark.parametrize("variant", [0, 1, 2])
 def test_the_ball_and_the_bricks_stop_at_each_other_and_at_the_room(variant):
     world, _, path = simulated("bricks", variant)
-    walls = [Block.around(part.mesh) for name, part in world.static.items() if name.startswith(("wall", "book"))]
+    parts = [part for name, part in world.static.items() if name.startswith(("wall", "book"))]
+    walls = [rigid_bodies.Block.around(part.mesh) for part in parts]
     for t in np.linspace(0, 0.1, 41):
         ball = world.poses(t)["ball"][:3, 3]
         turn, position = path.at(t)
@@ -199,7 +182,7 @@ def test_the_ball_and_the_bricks_stop_at_each_other_and_at_the_room(variant):
 
 
 def test_bodies_stop_at_blocks():
-    block = Block.around(box((0.1, 0.4, 0.3), (0.3, 0, 0.15)))
+    block = rigid_bodies.Block.around(box((0.1, 0.4, 0.3), (0.3, 0, 0.15)))
     np.testing.assert_allclose([block.low, block.high], [(0.25, -0.2, 0), (0.35, 0.2, 0.3)])
     ball = Body("sphere", (0.02,), (0, 0, 0.1), velocity=(10.0, 0, 0))
     free, stopped = (simulate([ball], 0.0, 0.05, blocks=b).positions[:, 0, 0].max() for b in ((), [block]))
@@ -217,9 +200,6 @@ def test_unstable_motion_is_not_returned(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log
     with pytest.raises(FloatingPointError, match="unstable"):
         simulate([Body("sphere", (0.02,), (0, 0, 1.0), velocity=(1e12, 0, 0))], 0.0, 0.001)
-
-
-# ---------------------------------------------------------------- time
 
 
 def test_poses_between_steps_are_those_of_slerp_and_ignore_the_quaternions_sign():
@@ -252,9 +232,6 @@ def test_the_same_arguments_give_the_same_bits(name):
     first, again = (simulated.__wrapped__(name, 1, 0.02)[2] for _ in range(2))
     np.testing.assert_array_equal(first.positions, again.positions)
     np.testing.assert_array_equal(first.quaternions, again.quaternions)
-
-
-# ---------------------------------------------------------------- contents of the images
 
 
 def test_the_wall_bursts_in_the_same_way_in_clips_of_any_length():
