@@ -25,6 +25,7 @@ from uuid import uuid4
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.method import DEFAULT_GIVEN, Progress
+from spike4dgs.benchmark.release.publish import TOKENS
 from spike4dgs.benchmark.release.source import VARIABLE as RELEASE
 from spike4dgs.benchmark.runs.apart.messages import (
     DONE,
@@ -54,7 +55,7 @@ _CODE = (
     "sys.path[:] = given + [p for p in sys.path if p not in given]; "
     "from spike4dgs.benchmark.runs.apart.child import main; sys.exit(main())"
 )
-_HIDDEN = (RELEASE, "OLDPWD")  # variables that tell where scenes lie
+_HIDDEN = (RELEASE, "OLDPWD", *TOKENS.values())  # variables that tell where scenes lie, and tokens to publish with
 _FOLDERS = ("SPIKE4DGS_", "TORCH_HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR")  # beginnings of variables of folders
 _WORDS = ("SPIKE4DGS_MITSUBA_VARIANT",)  # that begin so and name none
 _END_S = 5.0  # for a process to end by itself
@@ -236,7 +237,7 @@ def _started(part: Path, work: Path, apart: Apart) -> Iterator[subprocess.Popen[
 
 
 def _environment(part: Path) -> dict[str, str]:
-    """Return the variables of the process: those of this one, paths absolute, without what tells where scenes lie."""
+    """Return the variables of the process: those of this one, paths absolute, without what no fit may know."""
     kept = {name: value for name, value in os.environ.items() if name not in _HIDDEN}
     named = {name: value for name, value in kept.items() if value and name.startswith(_FOLDERS) and name not in _WORDS}
     folders = {name: str(Path(value).expanduser().absolute()) for name, value in named.items()}

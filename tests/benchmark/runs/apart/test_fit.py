@@ -126,6 +126,12 @@ def test_a_fit_reads_the_folders_that_the_callers_variables_name(
     }
 
 
+@pytest.mark.parametrize("name", ["ZENODO_TOKEN", "HF_TOKEN", "SPIKE4DGS_UPLOAD_TOKEN"])
+def test_a_fit_gets_no_token_of_its_caller(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(name, "secret")
+    assert "secret" not in "".join(_environment(tmp_path).values())
+
+
 @pytest.mark.parametrize("split", ["corner", "views-3"])
 def test_other_splits_hold_out_their_own_cameras(split: str, tmp_path: Path) -> None:
     scene, seen = write_small_scene(tmp_path / "scene", splits=True), tmp_path / "seen.json"
