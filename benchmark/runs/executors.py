@@ -99,13 +99,15 @@ def _pool(task: Callable[[Any], Any], workers: int) -> Iterator[ProcessPoolExecu
     context = get_context("spawn")
     arguments = (task, context.Value("i", 0), workers, os.getpid())
     pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=arguments)
+    at_work = True
     try:
         yield pool
+        at_work = False
     except BrokenProcessPool:
         fix = "run the same command again, with fewer --workers if memory ran out"
         raise problem("a worker process", "that it ends its task", "it died (out of memory, or killed)", fix) from None
     finally:
-        running = list((pool._processes or {}).values())  # the shutdown forgets them
+        running = list((pool._processes or {}).values()) if at_work else []  # the shutdown forgets them
         pool.shutdown(wait=False, cancel_futures=True)
         for process in running:  # what it does would only be thrown away
             process.terminate()

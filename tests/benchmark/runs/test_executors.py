@@ -1,6 +1,8 @@
 """Executors: the same results in the same order everywhere, and clear errors."""
 
+import multiprocessing
 import os
+import signal
 import socket
 import time
 from pathlib import Path
@@ -106,6 +108,19 @@ def test_a_worker_at_work_ends_after_the_error_of_another(tmp_path):
     with executor(2) as run, pytest.raises(UserError, match="Switch it on"):
         list(run(fail_beside_a_long_task, [(path, False), (path, True)]))
     wait_for(lambda: has_ended(int(path.read_text())), 30)
+
+
+def note_signals(path):
+    signal.signal(signal.SIGTERM, lambda *_: path.touch())
+
+
+def test_no_worker_of_a_run_that_ends_well_is_killed(tmp_path):
+    """COLMAP's library prints a stack of calls where it is."""
+    path = tmp_path / "killed"
+    with executor(2) as run:
+        list(run(note_signals, [path] * 4))
+    wait_for(lambda: not multiprocessing.active_children(), 30)
+    assert not path.exists()
 
 
 def test_a_scheduler_that_does_not_answer_is_one_error(monkeypatch):
