@@ -13,7 +13,7 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, update_wrapper
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -71,13 +71,19 @@ def cached_jit(jit: Callable[..., Any], **options: Any) -> Callable[[Callable[..
     def decorate(function: Callable[..., Any]) -> Any:
         with _lock:  # the setting belongs to numba: another package must not see it
             before, base = config.CACHE_DIR, config.CACHE_DIR or _folder()
-            config.CACHE_DIR = folder = os.path.join(base, parts_digest(function))
+            config.CACHE_DIR = folder = os.path.join(base, _digest_of(function, options))
             try:
                 return jit(cache=_is_writable(folder), **options)(function)
             finally:
                 config.CACHE_DIR = before
 
     return decorate
+
+
+def _digest_of(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
+    """Return the digest of a kernel's parts and of the compiler's options, which may come from another file."""
+    texts = [f"{k}={sorted(v) if isinstance(v, set) else v!r}" for k, v in sorted(options.items())]
+    return hashlib.sha256(" ".join([parts_digest(function), *texts]).encode()).hexdigest()[:12]
 
 
 def parts_digest(function: Callable[..., Any]) -> str:

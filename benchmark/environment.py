@@ -196,7 +196,7 @@ def choose_device(device: str, *, rasterizes: bool = True) -> str:
             )
             return "cpu"
         return "cuda"
-    index = device.partition(":")[2] or "0"
+    index = device.partition(":")[2] if ":" in device else "0"
     if not index.isdigit() or int(index) >= torch.cuda.device_count():
         raise problem("--device", "a CUDA device of this machine", repr(device), "use --device cpu")
     if rasterizes and (missing := missing_rasterizer(device)):

@@ -104,7 +104,7 @@ class Response:
     white: Float64  # [H, W] charge per tick that a pixel adds under radiance 1, in spikes
     dark: Float64  # [H, W] charge per tick in the dark
     unit: float  # spikes per tick of white of the whole array, the unit of errors
-    good: Mask  # [H, W] neither dead nor hot
+    good: Mask  # [H, W] neither dead, nor hot, nor flickering
     dead_ticks: float = 0.0  # after a spike, in which a pixel gathers nothing
 
     def rate(self, radiance: Float64) -> Float64:
@@ -115,14 +115,17 @@ class Response:
 def response_of(
     recordings: Recordings | None, shape: tuple[int, int], radiance_gain: float, dead_ticks: float = 0.0
 ) -> Response:
-    """Return a camera's response; without recordings all pixels have the gain 1 and no dark rate, and none is bad."""
+    """Return a camera's response; without recordings all pixels have the gain 1 and no dark rate, and none is bad.
+
+    A camera may be more or less sensitive than the array: its recordings tell that too.
+    """
     unit = float(fired(radiance_gain, dead_ticks))
     if recordings is None:
         ones = np.ones(shape)
         return Response(radiance_gain * ones, 0 * ones, unit, np.ones(shape, np.bool_), dead_ticks)
     found, bad = estimate(recordings), from_recordings(recordings.flat, recordings.dark)
-    white, dark = radiance_gain * found.gain.astype(np.float64), found.dark.astype(np.float64)
-    return Response(white, dark, unit, ~(bad.dead | bad.hot), dead_ticks)
+    white, dark = found.radiance_gain * found.gain.astype(np.float64), found.dark.astype(np.float64)
+    return Response(white, dark, unit, ~bad.all, dead_ticks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -219,11 +219,16 @@ def part_of(path: str) -> str:
 
 
 def camera_of(path: str, cameras: Collection[str]) -> str | None:
-    """Return the camera that a file belongs to, by the names of its folders and its own; None for the scene's files."""
-    *folders, name = path.split("/")
-    named = [word for word in folders if word in cameras]
+    """Return the camera that a file belongs to, by the names of its folders and its own; None for the scene's files.
+
+    The folder at the top names a part, and those of COLMAP's model and of the recordings no camera, such as `0`.
+    """
+    top, *folders, name = path.split("/") if "/" in path else (path, path)
+    if top == path or top == "sparse":
+        return None
+    named = [word for word in folders if word in cameras and top != "calibration"]
     named = named or sorted((c for c in cameras if name.startswith(f"{c}.")), key=len)[-1:]  # `cam` begins `cam.1` too
-    return named[0] if folders and named else None
+    return named[0] if named else None
 
 
 def member_name(scene: str, path: str, camera: str | None) -> str:
@@ -231,7 +236,7 @@ def member_name(scene: str, path: str, camera: str | None) -> str:
     words = path.split("/")
     if camera is not None:
         words[-1] = words[-1].removeprefix(f"{camera}.")
-        words = [word for word in words if word != camera]
+        words = [words[0], *(word for word in words[1:] if word != camera)]
     return f"{scene}/{SCENE_SAMPLE if camera is None else camera}.{'.'.join(words)}"
 
 

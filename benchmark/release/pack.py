@@ -11,6 +11,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
@@ -49,7 +50,6 @@ from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.counted_recording import encode_recording
 
 SUMS = "SHA256SUMS"
-_COUNTED = ".counted"  # copies of scenes, while they are packed
 _SHARDS_PER_FOLDER = 1000  # two files each: well below what hosts allow in a folder
 
 
@@ -61,7 +61,7 @@ class _PlannedSample:
     camera: str | None
     files: tuple[PlannedFile, ...]
 
-    @property
+    @cached_property
     def packed_bytes(self) -> int:
         return sum(file.packed_bytes for file in self.files)
 
@@ -75,8 +75,9 @@ def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int, flat: 
     if twice := [s.id for i, s in enumerate(scenes) if s.id in [other.id for other in scenes[:i]]]:
         raise problem(scenes[0].root, "scenes of different ids", f"{twice[0]} twice", "name each scene once")
     out = out.absolute()  # `.` has no name
+    copies = out.with_name(f".{out.name}.counted")  # of scenes, while they are packed
     with locked(out.with_name(f".{out.name}.lock"), out, "a folder that no other program packs into"):
-        scenes = [_with_counts(scene, out / _COUNTED / scene.id) for scene in scenes]
+        scenes = [_with_counts(scene, copies / scene.id) for scene in scenes]
         samples = [sample for scene in scenes for sample in _samples(scene)]
         shards = list(_in_shards(samples, shard_bytes))
         folders = ["" if flat else f"shards/{i // _SHARDS_PER_FOLDER:03d}/" for i in range(len(shards))]
@@ -92,7 +93,7 @@ def pack(scenes: Sequence[Scene], out: Path, name: str, shard_bytes: int, flat: 
                     progress.skip(sum(file.bytes for file in files))
                 written.append(shard or write_shard(out, shard_name, files, progress.advance))
         _write_descriptions(out, name, scenes, shards, written)
-        shutil.rmtree(out / _COUNTED, ignore_errors=True)
+        shutil.rmtree(copies, ignore_errors=True)
     return read_release(out)
 
 
@@ -135,11 +136,13 @@ def _samples(scene: Scene) -> Iterator[_PlannedSample]:
 def _in_shards(samples: Iterable[_PlannedSample], shard_bytes: int) -> Iterator[list[_PlannedSample]]:
     """Yield the samples of each shard: neighbours, as many as fit."""
     held: list[_PlannedSample] = []
+    size = 0
     for sample in samples:
-        if held and sum(s.packed_bytes for s in held) + sample.packed_bytes > shard_bytes:
+        if held and size + sample.packed_bytes > shard_bytes:
             yield held
-            held = []
+            held, size = [], 0
         held.append(sample)
+        size += sample.packed_bytes
     if held:
         yield held
 

@@ -153,15 +153,17 @@ class _Download:
         }
         cut = (ticks.start * tick_bytes, ticks.stop * tick_bytes)
         wanted = [Wanted(shard, m, root / f"{m.camera}.dat", cut) for shard, m in self._members(scene)]
-        started = root / _STARTED
+        started, hashes = root / _STARTED, dict[str, str]()
         if (root / folder.NAME).is_file():
-            if read_json(root / folder.NAME, "a description of streams").get("excerpt") != excerpt:
+            described = read_json(root / folder.NAME, "a description of streams")
+            if described.get("excerpt") != excerpt:
                 raise problem(root, "this window of the scene, or no folder", "something else", "choose another --out")
+            hashes = described.get("sha256", {})
         elif not (started.is_file() and read_json(started, "the record of a download").get("excerpt") == excerpt):
             for w in wanted:  # of another window or by another program: nothing says of which ticks
                 w.path.unlink(missing_ok=True)
             write_json(started, {"excerpt": excerpt})
-        whole = [w for w in wanted if w.path.is_file()]  # a file gets its name last
+        whole = [w for w in wanted if _is_window(w.path, cut[1] - cut[0], hashes)]
         for w in whole:
             w.part.unlink(missing_ok=True)
         transfer(self.source, [w for w in wanted if w not in whole], self.progress, self.workers)
@@ -172,7 +174,8 @@ class _Download:
             streams[path.stem] = open_stream(
                 path, *size, scene.rate_hz, rows_bottom_up=order, n_ticks=n_ticks, gaps=gaps, dead_ticks=dead
             )
-        folder.write_stream_folder(root, streams, {"excerpt": excerpt})
+        hashes = {camera: sha256_file(root / f"{camera}.dat") for camera in streams}
+        folder.write_stream_folder(root, streams, {"excerpt": excerpt, "sha256": hashes})
         started.unlink(missing_ok=True)
 
     def _members(self, scene: SceneEntry) -> Iterator[tuple[Shard, Member]]:
@@ -187,6 +190,13 @@ class _Download:
                 self.read = (number, parse_shard(text, shard, where))
             for member in self.selection.members(self.read[1], scene):
                 yield shard, member
+
+
+def _is_window(path: Path, size: int, hashes: Mapping[str, str]) -> bool:
+    """Return whether a window's stream is there and whole; and undamaged, where its hash is known."""
+    if not path.is_file() or path.stat().st_size != size:
+        return False
+    return path.stem not in hashes or sha256_file(path) == hashes[path.stem]
 
 
 def _gaps_in(scene: SceneEntry, camera: str, ticks: range) -> tuple[Gap, ...]:

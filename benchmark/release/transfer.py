@@ -81,6 +81,7 @@ class _File:
             if wanted.cut is None and wanted.path.is_file():
                 held = self._good(wanted.path)
                 if len(held) == len(wanted.blocks) and wanted.path.stat().st_size == wanted.member.bytes:
+                    wanted.part.unlink(missing_ok=True)  # it would replace the file
                     return held
                 os.replace(wanted.path, wanted.part)
                 return held

@@ -54,8 +54,8 @@ def find_bad(stream: SpikeStream, flat: Recording | None = None, dark: Recording
     """
     if flat and dark:
         return from_recordings(flat, dark)
-    seen = max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
     held = present(set(stream.gaps) - set(stream.filled), stream.n_ticks)
+    seen = max(int(held.sum()), 1)  # what was filled is among the counts
     return isolated(total_counts(stream) / seen, seen, deviation(stream, held))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import pytest
 
 import spike4dgs.benchmark
@@ -118,6 +119,16 @@ def test_a_kernel_is_compiled_anew_where_another_file_changes_what_is_in_it(kern
     texts = [PARTS, PARTS.replace("SCALE = 2", "SCALE = 7"), PARTS.replace("_ADDED = 1", "_ADDED = 30"), PARTS]
     found, counts = changed_parts(kernel_folder, texts)
     assert found == [21, 71, 50, 21] and counts == [1, 2, 3, 3], "the last is the first one's"
+
+
+def test_a_kernel_is_compiled_anew_where_another_file_changes_the_compilers_options(kernel_folder: Path) -> None:
+    """Of a division by zero numba's own error model makes an error, and NumPy's an infinity."""
+    text = KERNEL.replace("SCALE, plus", "OPTIONS, SCALE").replace("(nogil=True)", "(**OPTIONS)")
+    (kernel_folder / "kernel_of_parts.py").write_text(text.replace("plus(SCALE * x)", "SCALE / (x - x)"))
+    texts = [PARTS + f"OPTIONS = dict(error_model={model!r})" for model in ("numpy", "python")]
+    assert changed_parts(kernel_folder, texts[:1])[0] == [np.inf]
+    with pytest.raises(ZeroDivisionError):
+        changed_parts(kernel_folder, texts[1:])
 
 
 INTRINSIC = """

@@ -25,7 +25,7 @@ from spike4dgs.benchmark.metrics.held_out_spikes import (
 )
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.scene.calibration import Recordings
-from spike4dgs.benchmark.spikes.bits import unpack
+from spike4dgs.benchmark.spikes.bits import pack, unpack
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import simulate_reference
@@ -249,6 +249,26 @@ def test_gain_and_dark_maps_and_bad_pixels_come_from_the_recordings() -> None:
     wrong = truth.copy()
     wrong[3, 4], wrong[5, 6] = 1, 0
     assert scores(record_around(stream, TICK, response), wrong) == known, "bad pixels are left out"
+
+
+@pytest.mark.parametrize("camera_gain", [0.8, 1.1])
+def test_a_camera_less_or_more_sensitive_than_the_array_is_judged_by_its_own_gain(camera_gain: float) -> None:
+    sensor = Sensor(camera_gain * GAIN)
+    even = (filmed(np.full(SHAPE, level), sensor, 7, 2000) for level in (0.7, 0.0))
+    response = response_of(Recordings(*even, 0.7), SHAPE, GAIN)
+    truth = np.random.default_rng(2).uniform(0.1, 0.8, SHAPE)
+    own = scores(record_around(filmed(truth, sensor), TICK, response), truth)
+    usual = scores(record_around(filmed(truth), TICK, PLAIN), truth)
+    assert own["spike_psnr_80"] == pytest.approx(usual["spike_psnr_80"], abs=1.5)
+    assert own["spike_deviance"] == pytest.approx(usual["spike_deviance"], abs=0.05)
+
+
+def test_pixels_that_flicker_are_left_out() -> None:
+    flat, dark = (filmed(np.full(SHAPE, level), Sensor(GAIN), 7, 2000) for level in (0.7, 0.0))
+    spikes = unpack(flat.packed, WIDTH, HEIGHT, True)
+    spikes[:, 2, 3] = (np.arange(2000) // 400) % 2  # off and on under steady light
+    response = response_of(Recordings(replace(flat, packed=pack(spikes)), dark, 0.7), SHAPE, GAIN)
+    assert np.argwhere(~response.good).tolist() == [[2, 3]]
 
 
 def test_windows_that_lack_a_tick_have_no_score() -> None:

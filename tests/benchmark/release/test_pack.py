@@ -17,7 +17,7 @@ from changes import files_in, flip_bit, leave_part
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked, read_json
 from spike4dgs.benchmark.release import shard as shard_module
-from spike4dgs.benchmark.release.index import BLOCK, Release, camera_of, read_release
+from spike4dgs.benchmark.release.index import BLOCK, Release, camera_of, member_name, read_release
 from spike4dgs.benchmark.release.pack import SUMS, counted_copy, pack
 from spike4dgs.benchmark.scene.scene import open_scene, open_scenes
 from spike4dgs.benchmark.scene.verify import verify_content
@@ -131,6 +131,7 @@ def test_what_is_there_is_not_overwritten(scene_folders: tuple[Path, ...], tmp_p
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="found notes.txt; choose another --out"):
         pack(open_scenes(scene_folders), tmp_path, "1", 6_000_000)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     with pytest.raises(UserError, match="expected scenes of different ids, found pattern-0 twice"):
         pack(open_scenes([scene_folders[0]] * 2), tmp_path / "new", "1", 6_000_000)
 
@@ -194,6 +195,10 @@ def test_files_belong_to_the_camera_whose_whole_name_they_bear() -> None:
     assert [camera_of(f"spikes/{camera}.dat", cameras) for camera in cameras] == list(cameras)
     paths = ("images/cam.0/000020.exr", "scene.json", "sparse/0/cameras.bin")
     assert [camera_of(path, cameras) for path in paths] == ["cam.0", None, None]
+    named = ("0", "images", "flat")  # as folders are that belong to no camera
+    paths = ("sparse/0/images.bin", "images/0/000020.exr", "images/images/20.exr", "calibration/flat/0.dat", "flat.json")
+    assert [camera_of(path, named) for path in paths] == [None, "0", "images", "0", None]
+    assert member_name("s", "images/images/20.exr", "images") == "s/images.images.20.exr"
 
 
 def test_the_working_folder(scene_folders: tuple[Path, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

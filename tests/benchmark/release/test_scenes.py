@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -323,6 +324,20 @@ class TestWhatIsThere:
         part.write_bytes(bytes(5 * BLOCK))
         fetch(str(release_folder), tmp_path)
         assert tree(tmp_path) == whole
+        part.write_bytes(bytes(100))  # beside a file that is whole
+        fetch(str(release_folder), tmp_path)
+        assert tree(tmp_path) == whole
+
+    @pytest.mark.parametrize("damage", [lambda path: flip_bit(path, 7), lambda path: os.truncate(path, 100)])
+    def test_a_damaged_window_is_mended(
+        self, damage: Callable[[Path], None], release_folder: Path, tmp_path: Path
+    ) -> None:
+        chosen = Selection(("pattern-0",), ("cam_00", "cam_02"), (), (100.0, 120.0))
+        (folder,) = fetch(str(release_folder), tmp_path, chosen).folders
+        whole = tree(folder)
+        damage(folder / "cam_02.dat")
+        report = fetch(str(release_folder), tmp_path, chosen)
+        assert tree(folder) == whole and 0 < report.fetched <= 2 * BLOCK
 
 
 def check_goes_on(release_folder: Path, whole: dict[str, bytes], out: Path) -> None:
