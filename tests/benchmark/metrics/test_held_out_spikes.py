@@ -25,8 +25,9 @@ from spike4dgs.benchmark.metrics.held_out_spikes import (
 )
 from spike4dgs.benchmark.metrics.image_pair import ImagePair
 from spike4dgs.benchmark.scene.calibration import Recordings
-from spike4dgs.benchmark.spikes.bits import pack, unpack
+from spike4dgs.benchmark.spikes.bits import unpack
 from spike4dgs.benchmark.spikes.gaps import Gap
+from spike4dgs.benchmark.spikes.stream import pack
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
 from spike4dgs.generators.sensor.reference import simulate_reference
 
