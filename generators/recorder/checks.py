@@ -86,13 +86,16 @@ def check_usb_memory(profile: RigProfile, limit_file: Path = USBFS_LIMIT) -> Use
 
 
 def check_memory(profile: RigProfile, seconds: float, continuous: bool, free: int | None = None) -> UserError | None:
-    """Check the memory for rings and, for a clip with tags, for the frames without tags, made before it is written."""
+    """Check the memory for rings and, where a clip in memory may consist of several parts, for the copy in one part.
+
+    Frames that are lost or belong to no clip lie between the parts where frames have counters. Where a camera cannot be
+    stopped, the clip begins anywhere in its ring, and goes on at the ring's start.
+    """
     layout = make_layout(profile.layout, profile.width, profile.height)
     free = free_bytes() if free is None else free
     kept_s = buffer_seconds(profile, seconds, free) if continuous else seconds
-    tick_bytes = layout.frame_bytes
-    if not continuous and layout.frame_bytes != layout.payload_bytes:
-        tick_bytes += layout.payload_bytes
+    copied = not continuous and (layout.count_tags or not all(c.start and c.stop for c in profile.cameras))
+    tick_bytes = layout.frame_bytes * (2 if copied else 1)
     flying = profile.transfers * profile.transfer_bytes
     need = len(profile.cameras) * (kept_s * profile.fps * tick_bytes + 2 * flying) + _SPARE_BYTES
     if free >= need:

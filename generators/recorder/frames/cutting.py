@@ -112,7 +112,8 @@ def agree(counters: Sequence[int], most: int) -> int | None:
 
 def joined(runs: Sequence[Run], n_ticks: int, frame_bytes: int) -> tuple[UInt8, NDArray[np.int64]]:
     """Return frames [n, frame_bytes] of all runs within the clip (a view, if there is one run) and their ticks [n]."""
-    cut = [(run.first_tick, run.frames[: max(n_ticks - run.first_tick, 0)]) for run in runs]
+    # What a cancelled read brings after the clip's end is a run of its own, and no reason for a copy.
+    cut = [(r.first_tick, r.frames[: n_ticks - r.first_tick]) for r in runs if r.first_tick < n_ticks]
     ticks = [first + np.arange(len(frames), dtype=np.int64) for first, frames in cut]
     if len(cut) == 1:
         return cut[0][1], ticks[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spike4dgs.benchmark.arrays import UInt8
-from spike4dgs.generators.recorder.frames.cutting import Cutter
+from spike4dgs.generators.recorder.frames.cutting import Cutter, joined
 from spike4dgs.generators.recorder.frames.delivery import Delivery
 from spike4dgs.generators.recorder.frames.layouts import make_layout
 from spike4dgs.generators.recorder.frames.ring import Ring
@@ -69,6 +70,18 @@ def test_what_waits_is_delivered_up_to_the_end_of_the_clip() -> None:
     assert [first for first, _ in got] == [0, 3, 6, 9, 12] and rings["cam"].waiting == 0
     frames = np.concatenate([f for _, f in got])
     np.testing.assert_array_equal(frames[:, 0], np.repeat(np.arange(5), 3)[:13])
+
+
+@pytest.mark.parametrize(("n_ticks", "view"), [(15, True), (14, True), (16, False)])
+def test_frames_beyond_the_clips_end_make_no_copy_of_it(n_ticks: int, view: bool) -> None:
+    """A cancelled read brings some, in a block that is not full and so has no neighbour."""
+    (ring,) = filled(6).values()
+    blocks = ring.blocks()
+    last = replace(blocks[-1], data=blocks[-1].data[:20].copy(), bytes=20)
+    runs = Cutter("cam", LAYOUT, ring).cut([*blocks[:-1], last])
+    frames, ticks = joined(runs, n_ticks, LAYOUT.frame_bytes)
+    assert ticks.tolist() == list(range(n_ticks)) and np.shares_memory(frames, ring.memory) is view
+    np.testing.assert_array_equal(frames[:, 0], np.repeat(np.arange(6), 3)[:n_ticks])
 
 
 def test_an_error_of_the_sink_is_raised_at_the_end() -> None:
