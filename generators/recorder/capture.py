@@ -15,7 +15,7 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
-from spike4dgs.generators.recorder.frames.cutting import Cutter, First, agree, first_frame, joined
+from spike4dgs.generators.recorder.frames.cutting import Cutter, First, agree, aligned, first_frame, joined
 from spike4dgs.generators.recorder.frames.delivery import Delivery
 from spike4dgs.generators.recorder.frames.gaps import INTERRUPTED
 from spike4dgs.generators.recorder.frames.layouts import COUNTER, Layout, make_layout
@@ -97,6 +97,7 @@ class _Capture:
         _compile(self.layout)
         self.links = {c.id: links[c.id] for c in sorted(profile.cameras, key=_primary) if c.id in links}
         self.restart = all(link.restartable for link in links.values())
+        self.from_start = self.restart and not self.layout.count_tags  # the first byte of each camera begins tick 0
         slots = _slots(profile, self.layout, n_ticks, continuous=sink is not None)
         self.rings = {camera: Ring(slots, profile.transfer_bytes, compact=sink is None) for camera in self.links}
         self.readers: dict[str, Reader] = {}
@@ -159,7 +160,8 @@ class _Capture:
         runs = {c: self.cutters[c].cut(ring.blocks()) for c, ring in self.rings.items()}
         n_ticks = self.n_ticks
         if self.interrupted:
-            sound = [self.cutters[c].next_tick for c, r in self.readers.items() if r.end == OK]
+            # A camera that never had a whole frame is a gap, and takes nothing from the others.
+            sound = [n for c, r in self.readers.items() if r.end == OK and (n := self.cutters[c].next_tick)]
             n_ticks = min(n_ticks, min(sound) if sound else max(c.next_tick for c in self.cutters.values()))
         if n_ticks <= 0 or not any(c.next_tick for c in self.cutters.values()):
             raise _nothing()
@@ -213,7 +215,7 @@ class _Capture:
             raise self.delivery.error
         if self.cutters:
             return
-        firsts = {c: first_frame(self.layout, self.rings[c].blocks()) for c in self.readers}
+        firsts = {c: first_frame(self.layout, self.rings[c].blocks(), self.from_start) for c in self.readers}
         if not (last or self._overdue()) and any(f is None and self.readers[c].alive for c, f in firsts.items()):
             return
         found = {c: f for c, f in firsts.items() if f is not None}
@@ -222,12 +224,19 @@ class _Capture:
             origin = agree([f.counter for f in found.values()], round(_SKEW_S * self.profile.fps))
             self.sync = ARRIVAL_TIMES if origin is None else FRAME_TAGS
         for camera, reader in self.readers.items():
-            first = found.get(camera, First(0, 0, origin or 0))
+            first = found.get(camera) or self._unknown_first(reader, origin or 0)
             ahead = 0 if origin is None else (origin - first.counter) % COUNTER
             reader.wanted = first.position + (ahead + self.n_ticks) * self.layout.frame_bytes
-            self.cutters[camera] = Cutter(camera, self.layout, self.rings[camera], origin, first.lead)
+            ring = self.rings[camera]
+            self.cutters[camera] = Cutter(camera, self.layout, ring, origin, first.lead, self.from_start)
         if self.sink is not None:
             self.delivery = Delivery(self.sink, self.rings, self.cutters, self.n_ticks)
+
+    def _unknown_first(self, reader: Reader, origin: int) -> First:
+        """Return what stands for the first frame of a camera that has none yet: its data count from now on."""
+        now = reader.ring.position  # before `origin` is looked at: a first block may arrive in between
+        begun = now if reader.origin is None else reader.origin
+        return First(begun, 0, origin) if self.layout.has_tags else aligned(self.layout, begun)
 
     def _overdue(self) -> bool:
         """Return whether one camera is so far ahead that the agreement leaves out another without a frame."""

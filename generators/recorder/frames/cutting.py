@@ -18,14 +18,22 @@ from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 class Cutter:
     """Cuts one camera's blocks into frames, and records which tick was complete when each read ended.
 
-    `origin` is the counter of tick 0 where the cameras have agreed on one. `lead` bytes are dropped first: those of a
-    frame that began before the recording.
+    `origin` and `from_start` are those of `TickCounter`. `lead` bytes are dropped first: those of a frame that began
+    before the recording.
     """
 
-    def __init__(self, camera: str, layout: Layout, ring: Ring, origin: int | None = None, lead: int = 0) -> None:
+    def __init__(
+        self,
+        camera: str,
+        layout: Layout,
+        ring: Ring,
+        origin: int | None = None,
+        lead: int = 0,
+        from_start: bool = False,
+    ) -> None:
         self.next_tick = 0  # after the last frame
         self._arrival: list[tuple[int, int]] = []
-        self._counter = TickCounter(layout, camera, origin)
+        self._counter = TickCounter(layout, camera, origin, from_start)
         self._frame_bytes, self._lead = layout.frame_bytes, lead
         self._flat = ring.memory.reshape(-1)
         self._base = self._flat.ctypes.data
@@ -81,14 +89,16 @@ class First:
     counter: int
 
 
-def first_frame(layout: Layout, blocks: Sequence[Block]) -> First | None:
-    """Return the first whole frame in these blocks, the first ones kept; None if there is none yet."""
+def first_frame(layout: Layout, blocks: Sequence[Block], from_start: bool) -> First | None:
+    """Return the first whole frame in these blocks, the first ones kept; None if there is none yet.
+
+    `from_start`: the stream's first byte begins a frame, and the ticks follow from the number of bytes.
+    """
     if not blocks:
         return None
     position = blocks[0].position
-    if not layout.has_tags:  # frames have followed each other since the stream's first byte
-        lead = -position % layout.frame_bytes
-        return First(position + lead, lead, 0)
+    if from_start or not layout.has_tags:  # frames have followed each other since the stream's first byte
+        return aligned(layout, position)
     data = np.empty(0, np.uint8)
     for block in blocks:
         if block.data is None or len(data) > 3 * layout.frame_bytes:
@@ -98,6 +108,12 @@ def first_frame(layout: Layout, blocks: Sequence[Block]) -> First | None:
         return None
     frame = data[lead : lead + layout.frame_bytes]
     return First(position + lead, lead, int(layout.counts(frame[None])[0]))
+
+
+def aligned(layout: Layout, position: int) -> First:
+    """Return the first frame at or after a position of a stream whose first byte begins a frame."""
+    lead = -position % layout.frame_bytes
+    return First(position + lead, lead, 0)
 
 
 def agree(counters: Sequence[int], most: int) -> int | None:

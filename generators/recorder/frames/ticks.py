@@ -31,7 +31,8 @@ class TickCounter:
     """Cuts one camera's bytes into frames and numbers them.
 
     `origin`: the counter of tick 0, where the layout has counters and the cameras have agreed on one; frames before it
-    are dropped. Without it, the first whole frame is tick 0.
+    are dropped. Without it, the first whole frame is tick 0. `from_start`: the first byte begins tick 0, so that a loss
+    in it is one as at any other tick; without tags this is so always.
 
     For example::
 
@@ -42,12 +43,12 @@ class TickCounter:
         gaps = counter.finish(n_ticks)
     """
 
-    def __init__(self, layout: Layout, camera: str, origin: int | None = None) -> None:
+    def __init__(self, layout: Layout, camera: str, origin: int | None = None, from_start: bool = False) -> None:
         self._layout, self._camera = layout, camera
         self._counter = None if origin is None else origin - 1  # of the last frame that was numbered
         self._tick = -1  # of the same frame; without counters, of the last frame that arrived or was skipped
         self._next = 0  # the tick after the last frame that was returned
-        self._synced = not layout.has_tags  # whether the beginning of the next frame is known
+        self._synced = from_start or not layout.has_tags  # whether the beginning of the next frame is known
         self._ended = False  # lost for good
         self._part = _NOTHING  # the beginning of a frame, or while out of step a possible one
         self._ahead = 0  # bytes to drop before the next frame begins
@@ -96,7 +97,7 @@ class TickCounter:
         """Record that an unknown number of bytes is missing here."""
         self._reason = self._reason or reason
         self._part, self._ahead = _NOTHING, 0
-        # Before the first frame nothing can be lost: tick 0 is still to come.
+        # Out of step before the first frame nothing can be lost: tick 0 is still to come.
         self._ended = self._ended or (self._synced and not self._layout.count_tags)
         self._synced = False
 

@@ -104,6 +104,22 @@ def test_an_interruption_keeps_the_ticks_that_every_camera_has() -> None:
     assert [len(c.ticks) for c in clip.cameras] == [150, 150, 20]
 
 
+def test_an_interruption_keeps_the_ticks_of_the_others_when_one_camera_never_had_a_whole_frame() -> None:
+    profile, frames, links = make(2, "tagged-rows", timeout_ms=60_000)
+    links["cam_00"].stream, links["cam_01"].stream = frames[0][:150].reshape(-1), np.zeros(1024, np.uint8)
+    stop = threading.Event()
+
+    def end(rates: Mapping[str, Rate]) -> None:
+        if rates["cam_00"].ticks == 150:
+            stop.set()
+
+    clip = capture(profile, links, SECONDS, stop=stop, on_rate=end)
+    assert clip.interrupted and clip.n_ticks == 150
+    for camera, source in zip(clip.cameras, frames, strict=True):
+        check_frames(camera, source, 150)
+    assert [len(c.ticks) for c in clip.cameras] == [150, 0]
+
+
 def test_ctrl_c_is_an_interruption_and_not_an_error() -> None:
     profile, frames, links = make(2, timeout_ms=60_000)
     for link in links.values():
@@ -181,6 +197,31 @@ def test_cameras_that_cannot_be_stopped_go_on_from_the_rehearsal(layout: str) ->
     assert min(starts) > 0, "frames before the trigger are dropped"
     if layout == "tagged-rows":
         assert len(starts) == 1, "the counters determine which frames belong together"
+
+
+@pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
+def test_a_camera_that_sends_nothing_until_the_others_have_agreed_is_recorded_whole(layout: str) -> None:
+    profile = rig(2, layout, timeout_ms=60_000)
+    size = layout_of(profile).frame_bytes
+    frames = [frames_of(i, layout_of(profile), 3000) for i in range(2)]
+    links, seen = rig_of(frames, profile), list[int]()
+    for link in links.values():
+        link.restartable, link.limit = False, 1024  # a read in the rehearsal
+
+    def let_first_go(state: str) -> None:
+        if state == "TRIGGERED":
+            links["cam_00"].limit = None
+
+    def let_second_go(rates: Mapping[str, Rate]) -> None:
+        seen.append(rates["cam_00"].ticks)
+        if len(seen) > 1 and seen[-2] > 2100:  # more than is waited for, and an agreement since
+            links["cam_01"].limit = None
+
+    clip = capture(profile, links, SECONDS, on_state=let_first_go, on_rate=let_second_go)
+    assert clip.complete and clip.n_ticks == N
+    for camera, source in zip(clip.cameras, frames, strict=True):
+        first = -(-1024 // size)
+        np.testing.assert_array_equal(camera.frames, source[first : first + N])
 
 
 def test_arrival_is_the_tick_that_was_complete_when_a_read_ended() -> None:

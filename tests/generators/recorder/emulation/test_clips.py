@@ -93,6 +93,11 @@ def test_a_camera_that_fails_keeps_every_earlier_tick(two: Scene, kind: str, tra
     assert failed.stats.end == kind
 
 
+def test_a_loss_in_the_first_frame_ends_a_camera_whose_ticks_are_then_unknown(two: Scene, tmp_path: Path) -> None:
+    failed = fail(two, tmp_path / "clip", Fault("cam_01", "lost bytes", 0, 10, 30), layout="line-tagged")
+    assert [(g.first_tick, g.ticks, g.reason) for g in failed.gaps] == [(0, N, "torn frame")]
+
+
 @pytest.mark.parametrize("layout", ["plain", "tagged-rows"])
 def test_a_short_read_between_frames_loses_nothing(two: Scene, layout: str, tmp_path: Path) -> None:
     profile = profile_of(two, layout=layout)

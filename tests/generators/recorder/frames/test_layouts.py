@@ -186,6 +186,22 @@ def test_a_loss_of_unknown_size_is_bridged_by_counters_and_ends_a_camera_without
         assert counter.finish(20) == (Gap("cam_00", 3, 6 if back else 17, "short read"),)
 
 
+@pytest.mark.parametrize("reason", ["short read", "torn frame"])
+def test_a_loss_in_the_first_frame_shifts_no_tick_where_the_first_byte_begins_it(reason: str) -> None:
+    for name in LAYOUTS:
+        layout = make_layout(name, *SMALL[name])
+        frames, size = layout.pack(packed_ticks(*SMALL[name], 20), 99), layout.frame_bytes
+        if reason == "torn frame" and not layout.has_tags:
+            continue  # such a loss goes unnoticed
+        counter = TickCounter(layout, "cam_00", 99 if layout.count_tags else None, from_start=True)
+        runs = counter.feed(frames.ravel()[:5])
+        if reason == "short read":
+            counter.lose(reason)
+        runs += counter.feed(frames.ravel()[size + 9 :])
+        assert ticks_of(runs, frames) == (list(range(2, 20)) if layout.count_tags else [])
+        assert counter.finish(20) == (Gap("cam_00", 0, 2 if layout.count_tags else 20, reason),)
+
+
 def test_torn_frames_repeats_and_leaps_never_yield_a_wrong_tick() -> None:
     layout, frames = tagged()
     size, data = layout.frame_bytes, frames.ravel()
