@@ -12,7 +12,7 @@ import usb1
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.frames.layouts import make_layout
-from spike4dgs.generators.recorder.resources import buffer_seconds, free_bytes, least_seconds
+from spike4dgs.generators.recorder.resources import buffer_seconds, free_bytes
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.link import udev_fix
 from spike4dgs.generators.recorder.usb.ports import Port
@@ -66,8 +66,6 @@ def check_machine(
     """
     found = [] if emulated else [check_usb_memory(profile)]
     found += [check_memory(profile, seconds, continuous), check_disk(profile, seconds, out, copied)]
-    if continuous:
-        found.append(check_ring(profile))
     return [p for p in found if p is not None]
 
 
@@ -117,16 +115,6 @@ def check_disk(profile: RigProfile, seconds: float, out: Path, copied: Collectio
         return None
     fix = "free some space, choose another disk, or lower --seconds"
     return problem(out, f"{need / 1e9:.1f} GB of free disk space", f"{free / 1e9:.1f} GB", fix)
-
-
-def check_ring(profile: RigProfile) -> UserError | None:
-    """Check that the reads in flight do not fill the ring: blocks that wait for the disk need room in it."""
-    need_s = least_seconds(profile)
-    if profile.ring_seconds is None or profile.ring_seconds >= need_s:
-        return None
-    fix = "raise --buffer-s (or ring_seconds in the profile), or lower transfer.in_flight or transfer.bytes there"
-    expected = f"a buffer of {need_s:.3g} s or more, twice the reads in flight"
-    return problem(f"rig {profile.name}", expected, f"{profile.ring_seconds:.3g} s", fix)
 
 
 def _serial(port: Port) -> str:

@@ -72,8 +72,8 @@ class Streaming:
 
     Attributes:
         continuous: Write to disk while recording, instead of afterwards from memory.
-        buffer_s: Seconds of all cameras that may wait in memory while the disk stalls, with --continuous. By default
-            what half of the free memory holds, 10 at most.
+        buffer_s: Seconds of all cameras that may wait in memory while the disk stalls, with --continuous; no less than
+            twice the reads in flight. By default what half of the free memory holds, 10 at most.
     """
 
     continuous: bool = False
@@ -180,7 +180,7 @@ def _with_buffer(profile: RigProfile, streaming: Streaming, length: float) -> Ri
         return profile
     if buffer_s is not None and not 0 < buffer_s < math.inf:
         raise problem("--buffer-s", "seconds above 0", f"{buffer_s:g}", "give the seconds that may wait in memory")
-    seconds = buffer_s or buffer_seconds(profile, length)
+    seconds = buffer_seconds(replace(profile, ring_seconds=buffer_s or profile.ring_seconds), length)
     size = seconds * len(profile.cameras) * bytes_per_s(profile)
     print(f"memory for {seconds:.3g} s of all cameras while the disk stalls: {size / 1e9:.2g} GB")
     return replace(profile, ring_seconds=seconds)

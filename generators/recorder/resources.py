@@ -41,11 +41,11 @@ def buffer_seconds(profile: RigProfile, seconds: float, free: int | None = None)
     """Return the seconds of data, of all cameras, that may wait in memory during a clip of `seconds`.
 
     The profile's `ring_seconds`; where it is None, what half of the `free` bytes (those of now) holds, but no more than
-    10 s or the whole clip.
+    10 s or the whole clip. In any case twice the reads in flight at least.
     """
-    if profile.ring_seconds is not None:
-        return profile.ring_seconds
     least = least_seconds(profile)
+    if profile.ring_seconds is not None:
+        return max(profile.ring_seconds, least)
     held = _SHARE * (free_bytes() if free is None else free) / (len(profile.cameras) * bytes_per_s(profile))
     return max(min(held, _MOST_S, seconds + least), least)
 

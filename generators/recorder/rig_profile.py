@@ -5,7 +5,6 @@ docs/rig_profile.md describes every key; docs/rig_example.toml is a whole profil
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.cameras import Camera, check_lens, check_rotation
 from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
 from spike4dgs.benchmark.spikes.sensor_model import MOST_DEAD_TICKS
-from spike4dgs.benchmark.untrusted import MAX_SIDE, Expected, read_npz, shown
+from spike4dgs.benchmark.untrusted import ID, MAX_SIDE, Expected, check_ids, is_id, read_npz, shown
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.toml_table import (
     FLAG,
@@ -40,9 +39,7 @@ PRIMARY, SECONDARY = "primary", "secondary"
 BOTTOM_UP, TOP_DOWN = "bottom-up", "top-down"
 PACKET_BYTES = 1024  # of a SuperSpeed bulk endpoint: a read of another multiple ends in an overflow error
 
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")  # of a camera and of a scene
-
-_ID = matching("a name of letters, digits, '.', '_' and '-'", NAME.match)
+_ID = matching(f"a name of {ID}", is_id)
 _POSITIVE = number(0, 1e12, "a positive number")
 _FINITE = number(-1e12, 1e12, "a finite number")
 _VECTOR = tuple_of(_FINITE, "a list of numbers")
@@ -271,12 +268,13 @@ def _array(value: Any, shape: tuple[int, ...]) -> Float64:
 def _check_whole(top: Table, p: RigProfile) -> None:
     """Check facts across keys: names used twice, roles, sizes that do not go together."""
     try:
-        second = p.fps * make_layout(p.layout, p.width, p.height).frame_bytes
+        make_layout(p.layout, p.width, p.height)
     except UserError as e:
         raise UserError(f"{top.path}, key layout: {e}") from None
     for key, names in (("id", [c.id for c in p.cameras]), ("serial", [c.serial for c in p.cameras])):
         if twice := _twice(names):
             raise top.error(f"camera.{key}", "another one for each camera", f"{twice!r} twice")
+    check_ids([c.id for c in p.cameras], "camera", f"{top.path}, key camera.id")
     if (primaries := [c.id for c in p.cameras if c.role == PRIMARY]) != primaries[:1] or not primaries:
         found = ", ".join(primaries) or "none"
         raise top.error("camera.role", "one primary camera", found, 'give role = "primary" to the one that triggers')
@@ -287,10 +285,6 @@ def _check_whole(top: Table, p: RigProfile) -> None:
     if bare and len(bare) < len(p.cameras):
         expected, found = "intrinsics and poses of all cameras, or of none", f"none of {', '.join(bare)}"
         raise top.error("calibration", expected, found, "calibrate the rig")
-    if p.ring_seconds is not None and p.ring_seconds * second < p.transfers * p.transfer_bytes:
-        found = f"{p.ring_seconds:g} s, {p.ring_seconds * second / 1e6:.3g} MB"
-        expected = f"room for {p.transfers} reads of {p.transfer_bytes} bytes in flight"
-        raise top.error("transfer.ring_seconds", expected, found, "enlarge it, or have fewer or smaller reads")
 
 
 def _twice(values: Sequence[str]) -> str | None:

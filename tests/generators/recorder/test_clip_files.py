@@ -238,8 +238,9 @@ def test_folders_that_a_recording_cannot_use(tmp_path: Path) -> None:
     (tmp_path / "old" / "scene.json").write_text("{}")
     with pytest.raises(UserError, match="a new or empty folder"):
         StreamFiles(tmp_path / "old", rig(), TICKS)
-    with pytest.raises(UserError, match="a scene's name"):
-        StreamFiles(tmp_path / "my clip", rig(), TICKS)
+    for name in ("my clip", "c" * 101):
+        with pytest.raises(UserError, match="expected the id of a scene"):
+            StreamFiles(tmp_path / name, rig(), TICKS)
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="folders on the way"):
         StreamFiles(tmp_path / "file" / "clip", rig(), TICKS)

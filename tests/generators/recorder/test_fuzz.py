@@ -238,8 +238,7 @@ def check_profile(profile: RigProfile) -> None:
     assert [c.role for c in profile.cameras].count("primary") == 1
     assert profile.calibrated or all(c.calibration is None for c in profile.cameras)
     assert profile.transfer_bytes % 1024 == 0 and profile.transfers > 0 and profile.fps > 0
-    flying = profile.transfers * profile.transfer_bytes
-    assert profile.ring_seconds is None or profile.ring_seconds * profile.fps * layout.frame_bytes >= flying
+    assert layout.frame_bytes > 0 and (profile.ring_seconds is None or profile.ring_seconds > 0)
     assert set(profile.held_out) < {c.id for c in profile.cameras}
     assert all(c.endpoint_out is not None or not c.start + c.stop for c in profile.cameras)
 
