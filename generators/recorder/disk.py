@@ -82,7 +82,7 @@ class DiskFile:
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=path.name, daemon=True)
         try:
-            os.posix_fallocate(self._fd, 0, n_bytes)
+            self._reserve(n_bytes)
         except BaseException:
             os.close(self._fd)
             path.unlink()
@@ -143,6 +143,15 @@ class DiskFile:
                 raise
         self.direct = False  # the file system supports the cache only
         return os.open(path, flags, 0o644)
+
+    def _reserve(self, n_bytes: int) -> None:
+        try:
+            return os.posix_fallocate(self._fd, 0, n_bytes)
+        except OSError as e:
+            if e.errno not in (errno.EINVAL, errno.EOPNOTSUPP) or not self.direct:
+                raise
+        self._cached()  # a system without fallocate has the C library write a byte of each block, which is not aligned
+        os.posix_fallocate(self._fd, 0, n_bytes)
 
     def _skip(self, at: int) -> None:
         """Leave zeros up to `at`."""

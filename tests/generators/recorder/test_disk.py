@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import subprocess
 import sys
@@ -140,6 +141,25 @@ def test_a_file_without_room_is_removed(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(OSError, match="no space left"):
         DiskFile(tmp_path / "file", 100, Buffers(1, 100))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [errno.EINVAL, errno.EOPNOTSUPP])
+def test_space_that_cannot_be_reserved_past_the_cache_is_reserved_through_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int
+) -> None:
+    reserve = os.posix_fallocate
+
+    def aligned(fd: int, at: int, n: int) -> None:
+        if fcntl.fcntl(fd, fcntl.F_GETFL) & os.O_DIRECT:
+            raise OSError(error, os.strerror(error))
+        reserve(fd, at, n)
+
+    monkeypatch.setattr(disk.os, "posix_fallocate", aligned)
+    file = DiskFile(tmp_path / "file", 50000, Buffers(1, 50000))
+    assert not file.direct and (tmp_path / "file").stat().st_size == 50000
+    file.write(0, noise(50000))
+    file.close(50000)
+    assert (tmp_path / "file").read_bytes() == noise(50000).tobytes()
 
 
 # ---------------------------------------------------------------- recordings
