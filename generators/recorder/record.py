@@ -108,7 +108,7 @@ def record(
         light: For a scene.
         worse: Imperfections of an emulated array. Such a capture holds nothing of the scene's truth.
     """
-    source = _source(rig, mode, emulation, worse)
+    source = _source(rig, mode, emulation, worse, seconds)
     worse_truth, continuous = emulation.worse_truth, streaming.continuous
     if worse_truth is not None and out.resolve() in (worse_truth.resolve(), *worse_truth.resolve().parents):
         raise problem("--worse-truth", f"a file outside {out}", str(worse_truth), "choose another place")
@@ -153,11 +153,11 @@ def record(
     return 0 if clip.complete else LOST_DATA
 
 
-def _source(rig: Path | None, mode: str, emulation: Emulation, worse: Imperfections) -> Source:
+def _source(rig: Path | None, mode: str, emulation: Emulation, worse: Imperfections, seconds: float | None) -> Source:
     if emulation.worse_truth is not None and worse == PERFECT:
         raise problem("--worse-truth", "imperfections, such as --worse.gain 0.02", "none", "add them, or leave it out")
     if emulation.emulate is not None:
-        return emulated_source(emulation.emulate, rig, mode, worse, emulation.seed)
+        return emulated_source(emulation.emulate, rig, mode, worse, emulation.seed, seconds)
     if worse != PERFECT:
         raise problem("--worse", "--emulate SCENE: no real array is made worse", "none", "add it, or leave out --worse")
     if rig is None:

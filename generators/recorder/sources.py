@@ -33,6 +33,7 @@ from spike4dgs.generators.recorder.usb.ports import Port
 CLIP, FLAT, DARK = ("clip", "flat", "dark")
 SECONDS = 0.5  # default length of a recording
 _READ_S = 1e-3
+_MOST_DROPPING = 10_000_000  # ticks of which some are dropped: each is drawn, and held in memory
 
 _BY_TICK = ("images", "masks", "geometry")  # FOLDER/CAMERA/TICK.*
 _WHOLE = ("calibration", "truth")
@@ -90,32 +91,52 @@ def real_source(rig: Path) -> Source:
     return Source(load_profile(rig))
 
 
-def emulated_source(path: Path, rig: Path | None, mode: str, worse: Imperfections = PERFECT, seed: int = 0) -> Source:
+def emulated_source(
+    path: Path,
+    rig: Path | None,
+    mode: str,
+    worse: Imperfections = PERFECT,
+    seed: int = 0,
+    seconds: float | None = None,
+) -> Source:
     """Return an emulated array that sends a scene's streams at their rate, or its recordings for `FLAT` and `DARK`.
 
-    Its cameras are those of the profile `rig`, or made from the scene; `worse` gives them imperfections. Raises
-    UserError where the scene cannot be read, has no such recordings, or does not go with the profile.
+    Its cameras are those of the profile `rig`, or made from the scene; `worse` gives them imperfections for `seconds`,
+    by default for what the scene has. Raises UserError where the scene cannot be read, has no such recordings, or does
+    not go with the profile.
     """
     scene = open_scene(path)
+    if scene.rate_hz != round(scene.rate_hz):
+        fix = "emulate another scene"
+        raise problem(path, "a whole number of ticks per second, as a rig has", f"{scene.rate_hz:g}", fix)
     streams = scene_streams(scene) if mode == CLIP else _calibration_streams(scene, mode)
     profile = _scene_profile(scene, TAGGED_ROWS if worse.dropped else PLAIN) if rig is None else load_profile(rig)
-    if profile.fps != round(scene.rate_hz):
+    if profile.fps != scene.rate_hz:
         fix = "correct fps in the profile, or leave the profile out"
         raise problem(f"rig {profile.name}", f"the scene's {scene.rate_hz:g} ticks per second", f"{profile.fps}", fix)
     ticks = min(len(packed) for packed in streams.values())
+    length = ticks / profile.fps
     if worse != PERFECT:
-        return _worse_source(profile, streams, ticks, mode, worse, seed)
-    array = EmulatedArray(profile, streams)
-    return Source(profile, emulated_ports(array), ticks / profile.fps, scene if rig is None and mode == CLIP else None)
+        dropping = seconds if mode == CLIP and worse.dropped else None
+        recorded = ticks if dropping is None else round(dropping * profile.fps)
+        return replace(_worse_source(profile, streams, recorded, mode, worse, seed), seconds=length)
+    shown = scene if rig is None and mode == CLIP else None
+    if shown and "calibration" in shown.meta and not shown.meta["sensor"]["rows_bottom_up"]:
+        fix = "give a rig profile too: then nothing but the streams is recorded"
+        raise problem(path, "calibration recordings with the bottom row first", "the top row first", fix)
+    return Source(profile, emulated_ports(EmulatedArray(profile, streams)), length, shown)
 
 
 def _worse_source(
     profile: RigProfile, streams: Mapping[str, UInt8], ticks: int, mode: str, worse: Imperfections, seed: int
 ) -> Source:
-    """Return an array with imperfections. It shows nothing of a scene's truth, which it would contradict.
+    """Return an array with imperfections for `ticks`. It shows nothing of a scene's truth, which it would contradict.
 
     Uniform light and darkness are recorded until nothing is lost: only a clip misses ticks.
     """
+    if worse.dropped and not 0 < ticks <= _MOST_DROPPING:
+        fix = "record for a shorter time, or leave out --worse.dropped"
+        raise problem("--seconds", f"1 to {_MOST_DROPPING} ticks with --worse.dropped", f"{ticks}", fix)
     if worse.dropped and mode == CLIP and not all(c.start and c.stop for c in profile.cameras):
         fix = "add them to the rig, or leave it out: ticks are lost after the rehearsal"
         raise problem("--worse.dropped", f"start and stop sequences of the cameras of {profile.name}", "none", fix)
@@ -129,7 +150,7 @@ def _worse_source(
         ppm={name: camera.clock.drift_ppm for name, camera in cameras.items()},
     )
     done = truth_record(worse, seed, cameras, profile.width)
-    return Source(with_wrong_calibrations(profile, cameras), emulated_ports(array), ticks / profile.fps, None, done)
+    return Source(with_wrong_calibrations(profile, cameras), emulated_ports(array), worse_truth=done)
 
 
 def _scene_profile(scene: Scene, layout: str) -> RigProfile:
@@ -200,11 +221,14 @@ def light_truth(light: Light, profile: RigProfile) -> Truth:
     files: dict[str, Path] = {}
     for mode, folder in ((FLAT, flat), (DARK, dark)):
         streams = open_stream_folder(folder)
-        kinds = {(s.width, s.height, s.n_ticks, s.rows_bottom_up) for s in streams.values()}
-        if not names <= streams.keys() or {k[:2] for k in kinds} != {(profile.width, profile.height)} or len(kinds) > 1:
-            found = f"{', '.join(streams)} of {', '.join(f'{k[0]}x{k[1]}' for k in kinds)}"
-            raise problem(folder, f"recordings of one length by the cameras of {profile.name}", found, "record them")
-        _, _, facts[f"{mode}_ticks"], rows_bottom_up = kinds.pop()
+        alike = profile.width, profile.height, profile.fps, profile.dead_ticks
+        kinds = {(s.width, s.height, s.rate_hz, s.dead_ticks, s.n_ticks, s.rows_bottom_up) for s in streams.values()}
+        if not names <= streams.keys() or {k[:4] for k in kinds} != {alike} or len(kinds) > 1:
+            wanted, *others = (f"{w}x{h} at {r:g} Hz, {dead:g} dead ticks" for w, h, r, dead, *_ in (alike, *kinds))
+            expected = f"recordings of one length by the cameras of {profile.name}, {wanted}"
+            found = f"{', '.join(streams)}, {' and '.join(others)}"
+            raise problem(folder, expected, found, "record them with this profile")
+        *_, facts[f"{mode}_ticks"], rows_bottom_up = kinds.pop()
         if not rows_bottom_up:  # files are copied as they are
             fix = "record them with `record`, or turn their rows over"
             raise problem(folder, "the bottom row first, as in a scene", "the top row first", fix)

@@ -185,6 +185,24 @@ def test_flat_and_dark_recordings_go_into_a_clip_and_feed_calibrate(scene, tmp_p
             np.testing.assert_array_equal(ours["dark"], theirs["dark"])
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rate_hz": 1562.5}, "a whole number of ticks per second, as a rig has, found 1562.5"),
+        ({"rate_hz": 0.4}, "a whole number of ticks per second, as a rig has, found 0.4"),
+        ({"sensor": {"model": "x/1", "rows_bottom_up": False}}, "calibration recordings with the bottom row first"),
+    ],
+)
+def test_a_scene_that_cannot_be_recorded_as_it_is_is_refused(scene, tmp_path, change, message):
+    shutil.copytree(scene, tmp_path / "other")
+    edit_json(tmp_path / "other/scene.json", lambda meta: meta.update(change))
+    write_manifest(tmp_path / "other")
+    with pytest.raises(UserError, match=message):
+        sources.emulated_source(tmp_path / "other", None, "clip")
+    if "sensor" in change:  # turned over
+        assert sources.emulated_source(tmp_path / "other", None, "flat").scene is None
+
+
 def test_a_profile_of_another_rate_than_the_scenes_is_refused(scene, tmp_path):
     rig = rig_of(scene, tmp_path / "rig")
     rig.write_text(rig.read_text().replace("[transfer]", "fps = 10000\n[transfer]"))
@@ -195,9 +213,11 @@ def test_a_profile_of_another_rate_than_the_scenes_is_refused(scene, tmp_path):
 def test_light_that_does_not_fit_is_refused(scene, tmp_path):
     profile = sources.emulated_source(scene, None, "clip").profile
     assert record("--emulate", scene, "--mode", "dark", "--out", tmp_path / "dark", "--seconds", "0.001") == 0
-    small, light = replace(profile, width=32), sources.Light(tmp_path / "dark", tmp_path / "dark", 0.7)
-    with pytest.raises(UserError, match="recordings of one length by the cameras of emulated-pattern"):
-        sources.light_truth(light, small)
+    light = sources.Light(tmp_path / "dark", tmp_path / "dark", 0.7)
+    sources.light_truth(light, profile)
+    for other in ({"width": 32}, {"fps": 40000}, {"dead_ticks": 1.0}):
+        with pytest.raises(UserError, match="of emulated-pattern.*, found .*, 40x24 at 20000 Hz, 0 dead ticks;"):
+            sources.light_truth(light, replace(profile, **other))
     with pytest.raises(UserError, match="a positive radiance"):
         sources.light_truth(replace(light, flat_radiance=0.0), profile)
     with pytest.raises(UserError, match="calibrate-rig"):

@@ -81,6 +81,21 @@ def test_a_worse_clip_shows_all_of_it_and_none_of_the_truth(scene, tmp_path, cap
     assert not folders & {"images", "masks", "geometry", "truth", "calibration"}
 
 
+def test_ticks_are_dropped_for_as_long_as_a_clip_lasts(scene, tmp_path, capsys):
+    drop = ("--emulate", scene, "--worse.dropped", "0.1", "--worse-truth", tmp_path / "t.json")
+    assert record(*drop, "--out", tmp_path / "x", "--seconds", 240 / 20000) == 3
+    for done in json.loads((tmp_path / "t.json").read_text())["cameras"].values():
+        # A loop of the scene is 80 ticks: the first is what it was for a clip of that length.
+        assert sum(t < 80 for t in done["dropped_ticks"]) < sum(t >= 80 for t in done["dropped_ticks"])
+    lost = {t for g in open_scene(tmp_path / "x", allow_gaps=True).gaps for t in range(g.first_tick, g.stop_tick)}
+    assert min(lost) < 80 and max(lost) >= 160
+    profile = scene_profile(open_scene(scene), layout="tagged-rows")
+    short, long = (draw(Imperfections(dropped=0.1), profile, n, 0) for n in (80, 240))
+    assert all(long[c].dropped[: len(short[c].dropped)] == short[c].dropped for c in short)
+    assert record(*drop, "--out", tmp_path / "y", "--seconds", 1e6) == 2
+    assert "--seconds: expected 1 to 10000000 ticks with --worse.dropped" in capsys.readouterr().err
+
+
 def test_light_and_darkness_show_the_same_pixels_and_gains(scene, tmp_path):
     worse = ("--worse.bad-pixels", 12, "--worse.gain", 0.1, "--worse.dropped", 0.01, "--seed", 2)
     truths = []
