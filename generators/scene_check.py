@@ -8,12 +8,13 @@ reference as much as from that rendering differs by noise.
 The check of made scenes against a reference, such as a release.
 
 A scene whose revision is another one is rendered once more, with other noise of the rendering and nothing else changed.
-That scene, OUT/.noise/ID, says how much noise alone changes.
+That scene, OUT/.noise/ID/REVISION/ID, says how much noise alone changes of the scene of this revision.
 """
 
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,12 +29,19 @@ from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.generators.profiles import Job
-from spike4dgs.generators.scene_differences import Difference, difference, differing_facts, images_of, truth_error
+from spike4dgs.generators.scene_differences import (
+    MOST_PIXELS,
+    Difference,
+    difference,
+    differing_facts,
+    images_of,
+    truth_error,
+)
 
 EQUAL, NOISE, CHANGE = "equal", "rendering noise", "change of the world"
 # The most that a difference may be of that between two noises. Between Mitsuba's variants the measures of a camera were
 # 0.90 to 1.06 times that (car-0-tiny), those of blocks over all cameras 0.80 to 1.59: few blocks are noisy.
-MOST_OF_CAMERA = {"bits": 1.25, "truth_rms": 1.5}
+MOST_OF_CAMERA = {"bits": 1.25, "truth_rms": 1.5, "masks": 2.0}
 MOST_OF_BLOCKS = {
     "spikes_block_rms": 1.75,
     "truth_block_rms": 1.75,
@@ -43,12 +51,14 @@ MOST_OF_BLOCKS = {
 MEANING = {
     "bits": "spike bits",
     "truth_rms": "truths",
+    "masks": "masks",
     "spikes_block_rms": "spikes per tick in blocks",
     "truth_block_rms": "truths in blocks",
     "spikes_block_max": "spikes per tick in the worst block",
     "truth_block_max": "truths in the worst block",
 }
-_NEGLIGIBLE = 1e-6  # of white, or of the bits: rounding alone
+_NEGLIGIBLE = {"masks": MOST_PIXELS}  # as of geometry: a mask's edges are those of the objects
+_ROUNDING = 1e-6  # of white, or of the bits
 
 
 @dataclass(frozen=True)
@@ -106,7 +116,7 @@ def _values(differences: Sequence[Difference]) -> dict[str, float]:
 def _beyond(where: str, most: Mapping[str, float], found: Mapping[str, float], noise: Mapping[str, float]) -> list[str]:
     lines = []
     for name in most.keys() & found.keys() & noise.keys():
-        if found[name] > max(most[name] * noise[name], _NEGLIGIBLE):
+        if found[name] > max(most[name] * noise[name], _NEGLIGIBLE.get(name, _ROUNDING)):
             times = f"{found[name] / noise[name]:.3g} times as much as" if noise[name] else "and not"
             lines.append(f"{where}: {MEANING[name]} differ {times} by noise; up to {most[name]:g} times is noise")
     return sorted(lines)
@@ -257,8 +267,11 @@ def _compare(job: Job, out: Path, made: Scene, reference: Scene, make: Make) -> 
     shapes = [(s.n_ticks, {c.id: (c.width, c.height) for c in s.cameras.values()}) for s in (made, reference)]
     if shapes[0] != shapes[1]:
         return Comparison(job.id, *revisions, facts), None
-    make(replace(job, noise=1), out / NOISE_FOLDER)
-    noise = open_scene(out / NOISE_FOLDER / job.id, allow_gaps=True)
+    folder = out / NOISE_FOLDER / job.id / made.revision[:16]
+    if not folder.is_dir():  # what is there instead is the noise of a scene that was made again since
+        shutil.rmtree(folder.parent, ignore_errors=True)
+    make(replace(job, noise=1), folder)
+    noise = open_scene(folder / job.id, allow_gaps=True)
     found = {camera: difference(made, reference, camera) for camera in made.cameras}
     floor = {camera: difference(made, noise, camera) for camera in made.cameras}
     return Comparison(job.id, *revisions, facts, found, floor), noise

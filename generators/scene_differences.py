@@ -120,6 +120,7 @@ class Difference:
         spikes_block_rms, spikes_block_max: of the means of spikes per tick in blocks of BLOCK_PX and WINDOW_TICKS.
         truth_rms: of the radiance of all images, clipped to [0, 1]; None where the camera has no images.
         truth_block_rms, truth_block_max: of its means in blocks of BLOCK_PX.
+        masks: share of the pixels of all masks, the moving regions, that differ; None where there are none.
     """
 
     bits: float
@@ -128,6 +129,7 @@ class Difference:
     truth_rms: float | None = None
     truth_block_rms: float | None = None
     truth_block_max: float | None = None
+    masks: float | None = None
 
     @property
     def truth_db(self) -> float | None:
@@ -146,10 +148,11 @@ def difference(a: Scene, b: Scene, camera: str) -> Difference:
     blocks = _counted_blocks(*streams)
     spikes = bits_that_differ(*streams), _rms(blocks), float(np.abs(blocks).max(initial=0))
     errors = [error for target in images_of(a, camera) if (error := truth_error(a, b, target)) is not None]
+    masks = _masks_that_differ(a, b, camera)
     if not errors:
-        return Difference(*spikes)
+        return Difference(*spikes, masks=masks)
     means = np.stack([block_means(error) for error in errors])
-    return Difference(*spikes, _rms(np.stack(errors)), _rms(means), float(np.abs(means).max()))
+    return Difference(*spikes, _rms(np.stack(errors)), _rms(means), float(np.abs(means).max(initial=0)), masks)
 
 
 def images_of(scene: Scene, camera: str) -> list[Target]:
@@ -167,6 +170,13 @@ def truth_error(a: Scene, b: Scene, target: Target) -> Float64 | None:
         return None
     first, second = (np.clip(scene.ground_truth(target).astype(np.float64), 0, 1) for scene in (a, b))
     return np.asarray(first - second) if first.shape == second.shape else None
+
+
+def _masks_that_differ(a: Scene, b: Scene, camera: str) -> float | None:
+    """Return the share of the pixels of a camera's masks that differ; None where no mask is in both scenes."""
+    names = a.manifest.files.keys() & b.manifest.files.keys()
+    targets = [t for t in images_of(a, camera) if f"masks/{t.name}.png" in names]
+    return float(np.mean([np.mean(a.moving(t) != b.moving(t)) for t in targets])) if targets else None
 
 
 def bits_that_differ(a: SpikeStream, b: SpikeStream) -> float:

@@ -14,10 +14,18 @@ import numpy as np
 import pytest
 from changes import edit_json
 from full_scene import write_full_scene
+from scipy.ndimage import binary_dilation
 from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.scene.images import read_exr, read_geometry, write_exr, write_geometry
+from spike4dgs.benchmark.scene.images import (
+    read_exr,
+    read_geometry,
+    read_mask,
+    write_exr,
+    write_geometry,
+    write_mask,
+)
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
@@ -80,13 +88,18 @@ def test_a_silent_block_of_spikes_is_measured(tmp_path: Path) -> None:
     assert found.spikes_block_rms == pytest.approx(lost / math.sqrt(15))
 
 
+def test_an_image_smaller_than_a_block_has_none(tmp_path: Path) -> None:
+    scene = open_scene(write_small_scene(tmp_path / "scene", width=7))
+    assert difference(scene, scene, "cam_03").truth_block_max == 0
+
+
 def test_block_means_leave_out_what_is_over() -> None:
     image = np.arange(20.0 * 17).reshape(20, 17)
     found = scene_differences.block_means(image)
     assert found.shape == (2, 2) and found[1, 1] == image[8:16, 8:16].mean()
 
 
-FLOOR = Difference(0.17, 1e-3, 4e-3, 5e-3, 1e-3, 4e-3)
+FLOOR = Difference(0.17, 1e-3, 4e-3, 5e-3, 1e-3, 4e-3, 2e-3)
 
 
 def compared(found: Difference, noise: Difference = FLOOR, facts: tuple[str, ...] = (), other: str = "b") -> Comparison:
@@ -179,8 +192,9 @@ def check(out: Path, references: Path) -> tuple[int, dict[str, Any]]:
     def make(job: Job, folder: Path) -> None:
         assert job.noise == 1 and job.render_seed != JOB.render_seed
         assert job.settings == {**JOB.settings, "noise": 1}
-        shutil.copytree(out.parent / "plain", folder / job.id)
-        add_noise(folder / job.id, 7)
+        if not (folder / job.id).exists():
+            shutil.copytree(out.parent / "plain", folder / job.id)
+            add_noise(folder / job.id, 7)
 
     code = scene_check.check_scenes([JOB], out, find_references(references, [JOB.id]), make)
     return code, json.loads((out / "check.json").read_text())["scenes"][0]
@@ -211,6 +225,17 @@ def test_other_noise_is_rendering_noise(scenes: tuple[Path, Path], capsys: pytes
     assert (out / "check.png").stat().st_size > 10_000 and "rendering noise" in (out / "check.md").read_text()
 
 
+def test_a_world_that_changed_since_the_last_check_is_not_judged_by_the_noise_of_before(
+    scenes: tuple[Path, Path],
+) -> None:
+    out, references = scenes
+    assert check(out, references)[1]["verdict"] == "rendering noise"
+    for root in (out / JOB.id, out.parent / "plain"):  # the world, from now on
+        change(root, lambda root: brighten(root, 0.1))
+    assert check(out, references)[1]["verdict"] == "change of the world"
+    assert len(list((out / scene_check.NOISE_FOLDER / JOB.id).iterdir())) == 1
+
+
 def moved(transforms: dict[str, Any], change: Callable[[float], float] = lambda x: x + 1e-6) -> None:
     for frame in transforms["frames"]:
         frame["transform_matrix"][0][3] = change(frame["transform_matrix"][0][3])
@@ -228,6 +253,11 @@ def other_map(root: Path) -> None:
     np.savez(root / "truth/cam_01.npz", **{**arrays, "gain": arrays["gain"] * np.float32(1.001)})
 
 
+def larger_masks(root: Path) -> None:
+    for path in root.glob("masks/cam_03/*.png"):
+        write_mask(path, binary_dilation(read_mask(path)))
+
+
 @pytest.mark.parametrize(
     ("damage", "reason"),
     [
@@ -237,6 +267,7 @@ def other_map(root: Path) -> None:
         (edit("scene.json", lambda m: m.update(radiance_gain=0.61)), "radiance_gain: 0.6, reference 0.61"),
         (deeper, "depth or thing in 1 of 1 images, most in geometry/cam_03/000020.exr: 100.00% of the pixels"),
         (other_map, "gain or dark map of cam_01"),
+        (larger_masks, "cam_03: masks differ and not by noise; up to 2 times is noise"),
     ],
 )
 def test_what_noise_does_not_explain_is_a_change(
