@@ -45,7 +45,7 @@ def make_dataset(
             "read-noise=0.006 dead-ticks=1". Scenes that differ in sensors, light, lost ticks or given poses alone are
             rendered once.
         audit: Compare random ticks with full renderings of 4 times the samples, and measure noise; see the report.
-        replace: Make damaged scenes, and scenes with other settings, again.
+        replace: Make existing scenes again, undamaged ones too.
         check: A folder of reference scenes, such as a release, or one scene folder. Scenes in OUT are made only where
             they are absent, and compared with those of the same id there: equal, rendering noise, or a change of the
             world. A scene that is not equal is rendered again with other noise. The report: OUT/check.md, .json, .png.

@@ -181,7 +181,7 @@ def make_dataset(
                 making(one, out, with_audit=audit)
 
         def make(job: Job, folder: Path) -> None:
-            if not _is_done(job, folder, False):
+            if not _is_done(job, folder, job.id in {j.id for j in todo}):
                 making(_Planned(job, ", other noise"), folder, with_audit=False)
 
         return check_scenes(jobs, out, references, make) if check else 0
@@ -200,7 +200,7 @@ def _planned(jobs: Sequence[Job], todo: Sequence[Job]) -> list[list[_Planned]]:
     """Return the scenes that are to be made, those of one rendering together."""
     renderings, number = Counter(map(rendering_of, jobs)), count(1)
     groups: dict[Job, list[Job]] = {}
-    for job in todo:
+    for job in sorted(todo, key=lambda job: job.physics.flicker > 0):  # last: it leaves no ground truth for others
         groups.setdefault(rendering_of(job), []).append(job)
 
     def planned(job: Job, rendering: Job) -> _Planned:

@@ -14,17 +14,19 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs import generators
 from spike4dgs.benchmark.environment import installed_version
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, read_json, remove_parts, sha256_json, write_json, writing
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
+from spike4dgs.benchmark.runs.method_code import sources_sha256
 from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Target, open_scene
@@ -135,7 +137,7 @@ class Maker:
 
     def _open_work(self) -> None:
         """Make the work folder, or keep it if it belongs to the same settings and programs."""
-        key = sha256_json({"settings": self.job.settings, "versions": self._versions})
+        key = work_key(self.job.settings, self._versions)
         path = self._work / "settings.json"
         if path.is_file() and read_json(path, "the settings of unfinished work").get("key") != key:
             shutil.rmtree(self._work)
@@ -150,12 +152,9 @@ class Maker:
     def _bytes_needed(self) -> float:
         p = self.job.profile
         pixels, ticks = p.width * p.height, self.job.n_ticks + streams.CALIBRATION_TICKS
+        spikes = len(p.views) * ticks * bytes_per_tick(p.width, p.height)
         keys = len(self.plan.ticks) * len(p.views) * pixels * _BYTES_PER_KEY_PIXEL
-        return (
-            len(p.views) * ticks * bytes_per_tick(p.width, p.height)
-            + keys
-            + len(self.targets) * pixels * _BYTES_PER_TRUTH_PIXEL
-        )
+        return spikes + keys + len(self.targets) * pixels * _BYTES_PER_TRUTH_PIXEL
 
     def _render_static(self) -> None:
         path = self._work / "targets.npz"  # written last
@@ -249,10 +248,8 @@ class Maker:
                 extras=streams.extras(job) | {"instances": self._object_names},
             ),
         )
-        clip, scene = (
-            self.store.instants(render_tasks.held_out_view(job), self.plan),
-            open_scene(self._scene, allow_gaps=True),
-        )
+        clip = self.store.instants(render_tasks.held_out_view(job), self.plan)
+        scene = open_scene(self._scene, allow_gaps=True)
         preview(clip.keys, clip.ticks, scene.stream(held_out), scene.radiance_gain, self._scene / "preview.webp")
         contact_sheet(scene, self._scene / "sheet.png")
         write_manifest(self._scene)
@@ -281,11 +278,20 @@ class Maker:
         return {str(k): name for k, name in enumerate(self.world.object_names, start=1)}
 
 
+def work_key(settings: dict[str, Any], versions: dict[str, str]) -> str:
+    """Return the key of unfinished work, which other code of this room, also of one version, does not go on with."""
+    return sha256_json([settings, versions, _sources()])
+
+
+@cache
+def _sources() -> str:
+    return sources_sha256([generators])
+
+
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
     """Keep a second process off the same scene, and remove the lock file where the scene is done."""
-    with locked(path, path.stem, "a scene that nobody else makes"):
+    with locked(path, path.stem, "a scene that nobody else makes", temporary=True):
         yield
-    path.unlink(missing_ok=True)
     with suppress(OSError):  # another process still has files there, or was the last
         path.parent.rmdir()

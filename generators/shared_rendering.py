@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import shutil
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark.files import sha256_json
+from spike4dgs.benchmark.files import locked
 from spike4dgs.generators.physics import Physics
 from spike4dgs.generators.profiles import Job
-from spike4dgs.generators.scene_maker import Maker
+from spike4dgs.generators.scene_maker import Maker, work_key
 
 # The physics that change no radiance, and of ground truth the light alone. A new one is shared once it stands here.
 AFTERWARDS = (
@@ -38,6 +38,7 @@ def rendering_of(job: Job) -> Job:
     return replace(job, physics=replace(job.physics, **without), gain_map=True, dark_map=True, shot_noise=True)
 
 
+_WAIT_S = 600.0  # while another process copies a rendering, of some GB
 # Of `scene/`: what cameras and their light make, which every scene has of its own.
 _OWN = ("spikes", "calibration", "conventional", "events", "truth")
 
@@ -50,25 +51,37 @@ class SharingMaker(Maker):
     """
 
     def _open_work(self) -> None:
-        if self._shared.is_dir() and not self._work.exists():
-            self._copy(self._shared, self._work)
+        with self._alone():
+            if self._shared.is_dir() and not self._work.exists():
+                self._copy(self._shared, self._work)
         super()._open_work()
 
     def _simulate(self) -> None:
-        if not self._shared.exists():
-            self._copy(self._work, self._shared)
+        with self._alone():
+            if not self._shared.exists():
+                self._copy(self._work, self._shared)
         super()._simulate()
 
     def forget(self) -> None:
         """Remove what scenes of this rendering share."""
-        shutil.rmtree(self._shared, ignore_errors=True)
+        with self._alone():
+            shutil.rmtree(self._shared, ignore_errors=True)
         with suppress(OSError):  # another process still has files there, or was the last
             self._shared.parent.rmdir()
 
     @property
     def _shared(self) -> Path:
-        key = sha256_json([rendering_of(self.job).settings, self._versions])
+        key = work_key(rendering_of(self.job).settings, self._versions)
         return self.out / ".work" / f"rendering-{key[:12]}"
+
+    def _alone(self) -> AbstractContextManager[None]:
+        """Keep other processes, which make other scenes of this rendering, off what is shared."""
+        expected = "a rendering that nobody else copies"
+        return locked(self._shared.with_suffix(".lock"), self._shared, expected, _WAIT_S, temporary=True)
+
+    @property
+    def _bytes_needed(self) -> float:
+        return super()._bytes_needed * (1 if self._shared.exists() else 2)  # its own, and what it leaves for others
 
     def _copy(self, source: Path, destination: Path) -> None:
         """Copy the files of a work folder elsewhere: keys, backgrounds and, where the light is steady, ground truth."""

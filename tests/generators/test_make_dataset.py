@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,11 +16,13 @@ from fake_renderer import FakeRenderer, render_fakes
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked
 from spike4dgs.benchmark.scene.images import read_geometry
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
 from spike4dgs.cli.make_dataset import make_dataset as command
 from spike4dgs.cli.make_dataset import physics_of
-from spike4dgs.generators import scene_maker, streams
+from spike4dgs.generators import make_dataset as dataset
+from spike4dgs.generators import scene_maker, shared_rendering, streams
 from spike4dgs.generators.make_dataset import SceneSettings, make_dataset, track_jobs
 from spike4dgs.generators.physics import PhysicsOptions
 from spike4dgs.generators.profiles import PROFILES, TRACKS, Job
@@ -36,7 +39,7 @@ def fake(monkeypatch):
 
 
 def make(*worlds, out, **settings):
-    options = {name: settings.pop(name) for name in ("audit", "replace") if name in settings}
+    options = {name: settings.pop(name) for name in ("audit", "check", "replace") if name in settings}
     return make_dataset([tiny(world, **settings) for world in worlds], out, **options)
 
 
@@ -209,6 +212,28 @@ def test_other_settings_do_not_reuse_unfinished_work(fake, tmp_path):
     assert seven["spikes/cam_00.dat"] != clean["spikes/cam_00.dat"]
 
 
+def test_unfinished_work_of_other_code_is_made_anew(fake, monkeypatch, tmp_path):
+    rendered = count_keys(monkeypatch)
+
+    def stop_at_truth(stage, steps, total):
+        if stage == "ground truth":
+            raise Stop
+        yield from steps
+
+    def keys_and_shared():
+        rendered.clear()
+        maker = SharingMaker(JOB, tmp_path, stop_at_truth)
+        with pytest.raises(Stop):
+            maker.make()
+        return len(rendered), maker._shared
+
+    (keys, shared), again = keys_and_shared(), keys_and_shared()
+    assert keys and again == (0, shared)
+    monkeypatch.setattr(scene_maker, "_sources", lambda: "of a world that was edited")
+    anew, other = keys_and_shared()
+    assert anew == keys and other != shared
+
+
 def test_maps_that_are_off_leave_no_file_and_change_the_stream(fake, tmp_path):
     off = files_in(Maker(replace(JOB, gain_map=False, dark_map=False), tmp_path / "off", plain).make())
     on = files_in(Maker(JOB, tmp_path / "on", plain).make())
@@ -217,11 +242,39 @@ def test_maps_that_are_off_leave_no_file_and_change_the_stream(fake, tmp_path):
     assert not [name for name in off if name.startswith("truth/")]
 
 
-def test_two_processes_do_not_make_one_scene(fake, tmp_path):
+def test_two_processes_do_not_make_one_scene(fake, monkeypatch, tmp_path):
     message = "car-0-tiny: expected a scene that nobody else makes, found a run in progress"
     with locked(tmp_path / ".work/car-0-tiny.lock", "x", "free"), pytest.raises(UserError, match=message):
         make("car", out=tmp_path)
+    maker, message = SharingMaker(JOB, tmp_path, plain), "expected a rendering that nobody else copies"
+    monkeypatch.setattr(shared_rendering, "_WAIT_S", 0.0)
+    with locked(maker._shared.with_suffix(".lock"), "x", "free"):
+        for touch in (maker.make, maker.forget):
+            with pytest.raises(UserError, match=message):
+                touch()
     assert not (tmp_path / "car-0-tiny").exists()
+
+
+def test_a_lock_is_removed_while_it_is_held(fake, monkeypatch, tmp_path):
+    """Else another process may have taken it, and a third one would find no lock."""
+    lock, removed = tmp_path / "x.lock", []
+
+    def unlink(path, missing_ok=False):
+        with pytest.raises(UserError, match="nobody"), locked(path, path, "a lock that nobody has"):
+            pass
+        removed.append(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", unlink)
+        with scene_maker._alone(lock):
+            pass
+    assert removed == [lock]
+
+
+def test_scenes_in_flickering_light_are_made_after_those_that_they_share_with():
+    jobs = [tiny(options=options) for options in ("flicker=0.08", "", "psf-px=0.5", "light=2")]
+    groups = [[one.job for one in plan] for plan in dataset._planned(jobs, jobs)]
+    assert groups == [[jobs[1], jobs[3], jobs[0]], [jobs[2]]]
 
 
 def test_the_last_of_several_processes_may_have_tidied_up(fake, tmp_path):
@@ -237,7 +290,7 @@ def test_the_last_of_several_processes_may_have_tidied_up(fake, tmp_path):
 
 def test_a_complete_scene_is_kept_checked_or_refused(fake, tmp_path, capsys):
     assert make("car", out=tmp_path) == 0
-    before = files_in(tmp_path / "car-0-tiny")
+    before, revision = files_in(tmp_path / "car-0-tiny"), open_scene(tmp_path / "car-0-tiny").revision
     report = json.loads((tmp_path / "car-0-tiny.report.json").read_text())
     assert set(report["stages_s"]) == {"background", "key frames", "ground truth", "streams", "description"}
     capsys.readouterr()
@@ -248,8 +301,13 @@ def test_a_complete_scene_is_kept_checked_or_refused(fake, tmp_path, capsys):
     flip_bit(tmp_path / "car-0-tiny/spikes/cam_02.dat", 100)
     with pytest.raises(UserError, match=r"cam_02\.dat.*--replace"):
         make("car", out=tmp_path)
-    assert make("car", out=tmp_path, replace=True) == 0
+    reference = Path(shutil.copytree(tmp_path / "car-0-tiny", tmp_path / "reference/car-0-tiny"))
+    write_manifest(reference)  # as another scene
+    noise = tmp_path / ".noise/car-0-tiny" / revision[:16] / "car-0-tiny"
+    shutil.copytree(reference, noise)  # which is none
+    assert make("car", out=tmp_path, replace=True, check=reference) == 1
     assert files_in(tmp_path / "car-0-tiny") == before
+    assert open_scene(noise).meta["source"]["noise"] == 1
 
 
 def test_a_foreign_folder_is_never_touched(fake, tmp_path):
@@ -299,6 +357,8 @@ def test_a_full_disk_is_noticed_before_work_begins(fake, tmp_path, monkeypatch):
     monkeypatch.setattr(scene_maker.shutil, "disk_usage", lambda path: SimpleNamespace(free=10_000))
     with pytest.raises(UserError, match="free disk space"):
         make("car", out=tmp_path)
+    shared = SharingMaker(JOB, tmp_path, plain)
+    assert shared._bytes_needed == 2 * Maker(JOB, tmp_path, plain)._bytes_needed
 
 
 @pytest.mark.parametrize("worlds", [("car",), ()])
