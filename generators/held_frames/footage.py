@@ -89,8 +89,9 @@ def _images(folder: Path) -> Footage | None:
     return Footage(tuple(files), len(files), width, height)
 
 
-def _natural(path: Path) -> list[str | int]:
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", path.name))]
+def _natural(path: Path) -> tuple[list[str | int], str]:
+    parts: list[str | int] = [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", path.name))]
+    return parts, path.name  # 01.png before 1.png
 
 
 def _read(path: Path) -> UInt8:

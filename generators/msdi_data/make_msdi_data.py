@@ -135,6 +135,8 @@ def make_shards(
     if min(make.rigs, make.instants) < 1 or min(variants, make.resting) < 0 or min(make.width, make.height) < 16:
         found = f"{variants} variants, {make.rigs} rigs, {make.instants} instants, {make.width}x{make.height}"
         raise problem("make-msdi-data", "counts from 1 up and at least 16x16 pixels", found, "correct them")
+    if make.instants > (most := round(DURATION_S * RATE_HZ) - 2 * REACH):
+        raise problem("--instants", f"at most {most}, the ticks of a clip", str(make.instants), "give fewer")
     if FIRST_TRAINING_VARIANT + variants > FIRST_SEASON_VARIANT:
         most = FIRST_SEASON_VARIANT - FIRST_TRAINING_VARIANT
         fix = f"variants from {FIRST_SEASON_VARIANT} on are kept for hidden seasons"

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.generators.held_frames.footage import find_footage, read_frames
+from spike4dgs.generators.held_frames.footage import _natural, find_footage, read_frames
 
 WIDTH, HEIGHT = 32, 16
 
@@ -32,6 +32,11 @@ def test_images_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     footage = found["left"]
     assert (footage.frames, footage.width, footage.height) == (12, WIDTH, HEIGHT)
     assert [int(image[0, 0]) for image in read_frames(footage, [0, 2, 11])] == [0, 20, 110]
+
+
+def test_images_of_equal_numbers_come_in_one_order() -> None:
+    names = [Path("01.png"), Path("1.png"), Path("02.png")]
+    assert sorted(names, key=_natural) == sorted(names[::-1], key=_natural) == names
 
 
 def test_a_video_gives_the_frames_that_are_asked_for_in_rgb(tmp_path: Path) -> None:

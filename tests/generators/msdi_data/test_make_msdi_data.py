@@ -157,6 +157,7 @@ def test_no_variant_that_is_kept_for_tests_is_ever_made() -> None:
         ({"worlds": ("cart",)}, "expected one of jaywalk, .* found .cart."),
         ({"bursts": MakeBursts(rigs=0)}, "expected counts from 1 up"),
         ({"variants": 8988}, "--variants: expected at most 8987, found 8988; variants from 9000 on are kept"),
+        ({"bursts": MakeBursts(instants=2000)}, "--instants: expected at most [0-9]+, the ticks of a clip, found 2000"),
         ({"bursts": MakeBursts(spp=12)}, "--spp: expected a power of two, found 12"),
     ],
 )
