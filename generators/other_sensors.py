@@ -106,7 +106,7 @@ class EventNoise:
     mismatch: float = 0.05  # standard deviation of a pixel's thresholds, of log radiance
     shot_hz: float = 5.0  # events of a black pixel a second, half of them positive; they change no stored radiance
     shot_bright: float = 0.25  # of that at white
-    refractory_us: float = 500.0  # after an event, in which a pixel sends none and stores on
+    refractory_us: float = 500.0  # after a change's event, in which others send none but are stored; shot events come
 
 
 _LEAST_THRESHOLD = 0.01  # as in v2e

@@ -28,10 +28,10 @@ def max_image_speed(
 ) -> float:
     """Return the speed in px/s of the fastest visible image point over all views and `samples` times of the clip.
 
-    Exact from geometry: every vertex of the moving meshes is projected at t and a microsecond later, rotation included.
-    Occlusion is ignored, so the result is an upper bound, reached wherever that vertex is visible. Images in mirrors
-    and panes count as visible too. Where the array moves along a `path`, so does what stands still at the near end of
-    the world's depth range.
+    Exact at those times from geometry: every vertex of the moving meshes is projected at t and a microsecond later,
+    rotation included. What is faster between them for a moment is missed. Occlusion is ignored, so the result is an
+    upper bound at those times, reached wherever that vertex is visible. Images in mirrors and panes count as visible
+    too. Where the array moves along a `path`, so does what stands still at the near end of the world's depth range.
     """
     fastest = 0.0
     for t in np.linspace(0.0, duration_s, samples):
@@ -94,7 +94,7 @@ class KeyPlan:
 
     Attributes:
         n_ticks, rate_hz: length of the clip and ticks per second.
-        max_px: largest motion of an image point between two of its keys.
+        max_px: largest motion of an image point between two of its keys, at the speeds that `max_image_speed` finds.
         chain: spacings in ticks, coarsest first, each a divisor of the one before. Keys at multiples of `chain[0]` are
             whole. At other multiples of `chain[k]` only pixels are traced whose motion over `chain[k - 1]` ticks is
             more than `max_px`; the others are interpolated from the coarser keys.
@@ -155,8 +155,8 @@ def spacings(speed_px_s: float, n_ticks: int, rate_hz: int, max_px: float) -> tu
     """Return the key spacings in ticks, coarsest first, for a clip whose fastest point has this speed.
 
     All divide a millisecond, so that a frame at every whole millisecond is exactly a key. The finest is the longest in
-    which no point moves by more than `max_px` (one tick, if even that is too long). Each other is the shortest multiple
-    of the one after it, as long as no point moves by more than 2.5 px.
+    which no point of this speed moves by more than `max_px` (one tick, if even that is too long). Each other is the
+    shortest multiple of the one after it, as long as that point moves by no more than 2.5 px.
     Raises UserError where a millisecond is no whole number of ticks.
     """
     per_ms, rest = divmod(rate_hz, 1000)

@@ -277,7 +277,7 @@ class MultiViewRenderer(Visibility):
 
 
 def anchor_s(world: WorldScene, cameras: Sequence[Camera], motion_px: float) -> float:
-    """Return the time between anchors of soft light, in which no image point moves farther."""
+    """Return the time between anchors of soft light, in which no point moves farther at its speed at 5 instants."""
     speed = max_image_speed(world, cameras, world.duration_s, samples=5)
     return motion_px / speed if speed > 0 else max(world.duration_s, 1e-3)
 
