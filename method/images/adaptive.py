@@ -37,6 +37,8 @@ from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.images.light import PixelLight, steady
 from spike4dgs.method.settings import Settings
 
+_MOST_WINDOWS = 256  # a pixel's own is a number of 8 bits
+
 
 @dataclass(frozen=True)
 class AdaptiveSettings(Settings):
@@ -53,9 +55,15 @@ class AdaptiveSettings(Settings):
 
 
 def half_windows(n_ticks: int, settings: AdaptiveSettings | None = None) -> NDArray[np.float64]:
-    """Return the windows' half lengths in ticks, ascending; the last covers a clip of `n_ticks` from anywhere in it."""
+    """Return the windows' half lengths in ticks, ascending; the last covers a clip of `n_ticks` from anywhere in it.
+
+    Raises UserError where more than 256 are needed.
+    """
     s = settings or AdaptiveSettings()
     steps = max(0, math.ceil(math.log(max(n_ticks, 1) / s.shortest, s.growth)))
+    if steps >= _MOST_WINDOWS:
+        expected = f"at most {_MOST_WINDOWS} windows for a clip of {n_ticks} ticks"
+        raise problem("adaptive", expected, f"{steps + 1} with {s}", "raise growth or shortest")
     return np.asarray(s.shortest * s.growth ** np.arange(steps + 1), np.float64)
 
 
@@ -113,11 +121,10 @@ def _between(light: Float64, shares: Float32, p: int, first: int, last: int) -> 
 @kernel
 def _of_a_tick(light: Float64, shares: Float32, p: int, first: int, last: int) -> float:
     """Return by how much `_between` is off at most: half the light of both ticks, as a spike is anywhere in its own."""
-    if len(shares) == 0:
-        return 1.0
-    end = len(light) - 1
-    both = light[min(first + 1, end)] - light[max(first - 1, 0)] + light[min(last + 1, end)] - light[max(last - 1, 0)]
-    return max(1.0, 1 + shares[p] * (both / 4 - 1))
+    share, end = shares[p] if len(shares) > 0 else 1.0, len(light) - 1
+    a, b = min(max(first, 1), end - 1), min(max(last, 1), end - 1)  # the clip's first and last tick as their neighbours
+    both = light[a + 1] - light[a - 1] + light[b + 1] - light[b - 1]
+    return max(1.0, 1 + share * (both / 4 - 1))
 
 
 @kernel

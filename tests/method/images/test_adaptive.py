@@ -39,6 +39,12 @@ def test_windows_without_a_meaning_are_refused(wrong):
         AdaptiveSettings(**wrong)
 
 
+def test_windows_that_no_number_of_8_bits_tells_are_refused():
+    assert len(half_windows(400, AdaptiveSettings(growth=1.022))) < 256
+    with pytest.raises(UserError, match="at most 256 windows for a clip of 400 ticks, found 260 with .* raise growth"):
+        half_windows(400, AdaptiveSettings(growth=1.0207))
+
+
 def test_constant_light_is_known_as_well_as_the_clip_allows():
     rng = np.random.default_rng(1)
     rates = rng.uniform(0.02, 0.6, (25, 40))
