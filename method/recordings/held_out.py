@@ -18,7 +18,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene
 from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.method.models.saved_model import SavedModel
-from spike4dgs.method.recordings.self_calibrated import LARGEST_ERROR_TICKS
+from spike4dgs.method.recordings.self_calibrated import LARGEST_ERROR_TICKS, light_changes
 from spike4dgs.method.self_calibration.clocks import clock_of_another
 from spike4dgs.method.self_calibration.poses import pose_of_another
 
@@ -46,7 +46,8 @@ class HeldOutView:
 def held_out_views(scene: Scene, fitted: TrainingScene, changed: Sequence[str], seed: int) -> dict[str, HeldOutView]:
     """Return the views of the held-out cameras, beside the `fitted` scene, of which `changed` was estimated anew.
 
-    Where that is "poses" or "clocks", a held-out camera's are estimated in the same way, from its own stream.
+    Where that is "poses" or "clocks", a held-out camera's are estimated in the same way, from its own stream. Its clock
+    stays as given where that does not tell it, and where its light changes.
     """
     views = {name: HeldOutView(scene.cameras[name]) for name in scene.test}
     for name, view in views.items() if changed else ():
@@ -54,7 +55,7 @@ def held_out_views(scene: Scene, fitted: TrainingScene, changed: Sequence[str], 
         if "poses" in changed:
             found = pose_of_another(fitted, view.camera, stream, scene.recordings(name), seed)
             view = replace(view, camera=found)
-        if "clocks" in changed:
+        if "clocks" in changed and not light_changes([stream]):
             told = clock_of_another(fitted, view.camera, stream, scene.recordings(name))
             if told.error_ticks <= LARGEST_ERROR_TICKS:
                 view = replace(view, clock=told.clock)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from spike4dgs.benchmark.metrics.pose_error import angle_deg
+from spike4dgs.benchmark.scene.camera_state import Clock
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.method.images.light import estimate_light
 from spike4dgs.method.recordings.recording import Recording
 from spike4dgs.method.self_calibration.clock_fit import ClockSettings
 from spike4dgs.method.self_calibration.clock_search import SearchSettings
@@ -38,11 +41,13 @@ def survey_clocks(
 ) -> Surveyed:
     """Return the scene with the clocks that its clip tells, notes, and columns for the report.
 
-    It is the same scene where the clip tells nothing, or where the clocks agree.
+    It is the same scene where the clip tells nothing, where its light changes, or where the clocks agree.
     """
     if len(scene.cameras) < LEAST_CAMERAS or scene.n_ticks < least_ticks(settings):
         least = f"{LEAST_CAMERAS} cameras and {least_ticks(settings)} ticks"
         return scene, (f"clocks: taken as given, because less than {least} tell nothing about them",), {}
+    if light_changes(scene.streams):
+        return scene, ("clocks: taken as given, because the light changes",), {}
     found = estimate_clocks(scene, settings, search)
     told = {c: e for c, e in found.cameras.items() if e.error_ticks <= LARGEST_ERROR_TICKS}
     columns = _columns(found)
@@ -62,6 +67,14 @@ def survey_clocks(
     if lost := [c for c in found.cameras if c not in told]:
         notes.append(f"the clocks of {', '.join(lost)} are not told by the clip: taken as given")
     return replace(scene, states=states), tuple(notes), columns
+
+
+def light_changes(streams: Sequence[SpikeStream]) -> bool:
+    """Return whether the light changes in any camera's clip: flicker looks like motion, a period late like on time.
+
+    Each is looked at for itself: clocks that differ would smear what all see together.
+    """
+    return any(estimate_light([stream], [Clock()]) is not None for stream in streams)
 
 
 def departure(e: ClockEstimate, n_ticks: int) -> float:

@@ -1,21 +1,27 @@
 """Poses and clocks of a recording before a fit: left alone where they are right, or where the clip tells nothing."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from clock_world import ClockWorld
+from lit_streams import lit
 from scipy.spatial.transform import Rotation
+from toy_world import GAIN
 
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.scene.camera_state import CameraState, Clock
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.training import ImageSettings, make_training_images
+from spike4dgs.method.recordings.held_out import held_out_views
 from spike4dgs.method.recordings.recording import GIVEN, Recording
 from spike4dgs.method.recordings.self_calibrated import self_calibrated, survey_clocks
 from spike4dgs.method.self_calibration.clock_fit import ClockSettings
 from spike4dgs.method.self_calibration.clock_search import SearchSettings
 
+FEW = ClockSettings(times=3, moving_patches=10, static_patches=8)
 SHORT = ClockWorld(width=120, height=76, n_ticks=96, travel=0.1).training
 
 
@@ -62,9 +68,23 @@ def test_clocks_that_differ_are_used() -> None:
 
 def test_where_nothing_moves_clocks_are_left_alone() -> None:
     still = ClockWorld(n_ticks=130, travel=0.0).training
-    few = ClockSettings(times=3, moving_patches=10, static_patches=8)
-    scene, notes, _ = survey_clocks(still, few, SearchSettings(times=2, patches=5, most_ticks=20))
+    scene, notes, _ = survey_clocks(still, FEW, SearchSettings(times=2, patches=5, most_ticks=20))
     assert scene is still and "too little moves to tell them" in notes[0]
+
+
+def test_where_light_changes_clocks_are_left_alone() -> None:
+    """A period of flicker late is like on time: of still scenes the search made clocks that are whole periods off."""
+    world = ClockWorld(n_ticks=130, travel=0.0)
+    flicker, rng = 1 + 0.2 * np.cos(2 * np.pi * np.arange(130) / 40), np.random.default_rng(0)
+    streams = {c.id: lit(flicker, GAIN * world.trace(c, 0.0)[0], rng) for c in world.cameras}
+    lamp = replace(world.training, streams=tuple(streams[c.id] for c in world.training.cameras))
+    scene, notes, _ = survey_clocks(lamp, FEW, SearchSettings(times=2, patches=5, most_ticks=20))
+    assert scene is lamp and notes == ("clocks: taken as given, because the light changes",)
+    name, one = world.held_out.id, replace(lamp, cameras=lamp.cameras[:1], streams=lamp.streams[:1])  # tells no clocks
+    folder: Any = SimpleNamespace(
+        cameras={name: world.held_out}, test=(name,), stream=streams.__getitem__, recordings=lambda _: None
+    )
+    assert held_out_views(folder, one, ["clocks"], 0)[name].clock == Clock()
 
 
 def test_images_are_made_at_each_cameras_own_tick() -> None:
