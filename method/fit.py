@@ -34,7 +34,7 @@ from spike4dgs.method.pose_refinement import REFINEMENT
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.self_calibration.from_clip import as_in_clip
 from spike4dgs.method.self_calibration.shading import with_shadings
-from spike4dgs.method.settings import FLAT_FIELD, Settings, SettingsByPart, as_dict, follow_images, override, scaled
+from spike4dgs.method.settings import FLAT_FIELD, SettingsByPart, as_dict, follow_images, in_budget, override
 from spike4dgs.method.starts.base import Initialization, Start, StartRequest, at_most, learned_facts, measure
 from spike4dgs.method.supervision.base import Supervision
 from spike4dgs.method.torch_state import check_device, kept_random_state, seeded
@@ -72,7 +72,7 @@ class Algorithm:
     label: str | None  # in descriptions of recipes; None: the motion's name
     settings: SettingsByPart
     fit: Callable[[FitJob], Model]
-    published: Mapping[str, Any] = field(default_factory=dict)  # overrides of the settings
+    published: Mapping[str, Any] = field(default_factory=dict)  # overrides of the settings, see `settings.in_budget`
     supervisions: tuple[str, ...] = ()
     calibrated: bool = False  # its loss compares with spikes of the cameras' calibrated response
     shaded: bool = False  # its loss takes the shadings that the clip tells
@@ -154,7 +154,8 @@ class RecipeMethod(Shown):
     def fit(self, scene: TrainingScene, request: FitRequest) -> Model:
         """Fit the training views, see `benchmark.method.Method`. Raises UserError: a foreign checkpoint, no device."""
         check_device(request.device)
-        settings: dict[str, Any] = self._for(request)
+        where, published = f"recipe {self.name}", self.algorithm.published
+        settings: dict[str, Any] = in_budget(self.settings, request.budget, published, where)
         request.progress(0, 1, "initialisation")
         recorded = None
         if isinstance(self.images, RecordedImages):
@@ -217,15 +218,6 @@ class RecipeMethod(Shown):
         steps = trainer.coarse_steps + trainer.fine_steps
         own = {"motion": algorithm.settings["motion"], "trainer": replace(trainer, coarse_steps=steps)}
         return algorithm, {**settings, **own}
-
-    def _for(self, request: FitRequest) -> dict[str, Settings]:
-        """Return the settings with the step counts of a request's budget."""
-        if not request.budget.published:
-            return scaled(self.settings, request.budget.scale)
-        if not (steps := self.algorithm.published):
-            expected = "a publication's step counts for --budget paper"
-            raise problem(f"recipe {self.name}", expected, "none", "choose another budget")
-        return override(self.settings, steps, f"recipe {self.name}")
 
 
 def describe(recipe: Recipe, parts: Parts, algorithm: Algorithm) -> str:

@@ -21,7 +21,7 @@ from spike4dgs.method.training_views.changes import POINTS
 class TrainerSettings(Settings):
     """Steps, poses, and how Gaussians begin and learn (prefix `trainer`)."""
 
-    # Steps. One step renders several views at one time, where 4DGS takes one image: 1 step here is 4 there.
+    # Steps. One step renders several views at one time, where 4DGS takes one image: a step of four views is 4 there.
     coarse_steps: int = 300  # static stage (4DGS: 3000 single images)
     fine_steps: int = 1200  # deforming stage (4DGS: 14000 single images)
     piece_steps: int = 800  # the same of each further piece of a long clip, where the motion model has pieces

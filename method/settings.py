@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self, TypeVar
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.method import Budget
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class Settings:
 
 
 FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
+VIEWS_PER_STEP = "views_per_step"  # a setting of parts whose steps have several views
 SettingsByPart = Mapping[str, Settings]
 S = TypeVar("S", bound=Settings)
 
@@ -64,6 +66,22 @@ def make_settings(overrides: Mapping[str, Any], where: str, defaults: S, prefix:
 def scaled(parts: SettingsByPart, scale: float) -> dict[str, Settings]:
     """Return the settings of all parts with the step counts multiplied by a budget's scale."""
     return {part: settings.scaled(scale) for part, settings in parts.items()}
+
+
+def in_budget(parts: SettingsByPart, budget: Budget, published: Mapping[str, Any], where: str) -> dict[str, Settings]:
+    """Return the settings of all parts with the step counts of a budget.
+
+    `published` are the publication's, by names PART.NAME, for steps of four views: where a part's steps have fewer,
+    there are more of them. Raises UserError where the budget asks for these and there are none.
+    """
+    if not budget.published:
+        return scaled(parts, budget.scale)
+    if not published:
+        expected = "a publication's step counts for --budget paper"
+        raise problem(where, expected, "none", "choose another budget")
+    views = [getattr(settings, VIEWS_PER_STEP) for settings in parts.values() if hasattr(settings, VIEWS_PER_STEP)]
+    steps = {name: round(4 * count / views[0]) if views else count for name, count in published.items()}
+    return override(parts, steps, where)
 
 
 def follow_images(settings: SettingsByPart, overrides: Mapping[str, Any]) -> dict[str, Settings]:

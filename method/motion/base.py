@@ -40,7 +40,7 @@ class Motion(nn.Module):
 
     label: ClassVar[str | None] = None  # in descriptions of recipes; None: the name
     defaults: ClassVar[Settings] = Settings()  # of the model's own settings
-    published: ClassVar[Mapping[str, Any]] = {}  # overrides that give the step counts of the publication
+    published: ClassVar[Mapping[str, Any]] = {}  # step counts of the publication, see `settings.in_budget`
     moves: ClassVar[bool] = True  # False: all times are the same, and only the static stage is trained
     rests_first: ClassVar[bool] = True  # a static stage comes before the moving one
     pixel_filter: PixelFilter = CUSTOMARY  # of the fit's renders; the trainer sets it

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch
 from hard_case import BYTES, HardCase
-from toy_fits import SMALL_PLANES, WORLD, checkpoints, method, request, silent, surfaces, trainer
+from toy_fits import MOTIONS, SMALL_PLANES, WORLD, checkpoints, method, request, silent, surfaces, trainer
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.method import Budget
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.images.training import ImageSettings, choose_ticks
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, stages
-from spike4dgs.method.settings import make_settings, override
+from spike4dgs.method.settings import as_dict, in_budget, make_settings, override
 from spike4dgs.method.splat import render
 from spike4dgs.method.starts.base import measure
 from spike4dgs.method.torch_state import seeded
@@ -285,6 +286,20 @@ def test_budget_scales_steps_only():
     steps = ("coarse_steps", "fine_steps", "piece_steps")
     assert all(getattr(half, name) == getattr(s, name) // 2 for name in steps)
     assert replace(half, **{name: getattr(s, name) for name in steps}) == s
+
+
+@pytest.mark.parametrize("motion", ["static", "hexplane", "spacetime"])
+def test_a_publications_steps_see_as_many_images_whatever_the_views_of_one(motion):
+    """Step counts of a publication are of steps of four views; the rounds of densification are as many, too."""
+    published = MOTIONS[motion].published
+
+    def per_image(views: int) -> dict[str, float]:
+        parts = {"trainer": TrainerSettings(views_per_step=views), "density": DensitySettings()}
+        found = as_dict(in_budget(parts, Budget(published=True), published, "recipe x"))
+        return {name: views * found[name.split(".")[0]][name.split(".")[1]] for name in published}
+
+    for views in (1, 2, 4, 8):
+        assert per_image(views) == {name: 4 * count for name, count in published.items()}
 
 
 def test_moving_scene_opens_up_from_the_middle_to_the_whole_clip():
