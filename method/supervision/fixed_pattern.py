@@ -69,6 +69,7 @@ class FixedPattern(Supervision):
     label = "the cameras' fixed patterns estimated from the clip"
     defaults = FixedPatternSettings()
     shaded = True
+    white: Tensor  # float64 [C, 1, 1], spikes per tick of white
     shading: Tensor  # s [C, H, W]
     gain: Tensor  # γ [C, H, W]
     dark: Tensor  # d [C, H, W], in white
@@ -76,15 +77,17 @@ class FixedPattern(Supervision):
 
     def __init__(self, settings: FixedPatternSettings, scene: TrainingScene) -> None:
         super().__init__()
-        self.settings, self.white = settings, scene.radiance_gain
-        camera = scene.cameras[0]
+        self.settings = settings
+        camera, states = scene.cameras[0], [scene.state(c.id) for c in scene.cameras]
         size = len(scene.cameras), camera.height, camera.width
-        told = [scene.state(c.id).shading for c in scene.cameras]
+        told = [state.shading for state in states]
         flat = np.ones(size[1:], np.float32)
         shading = np.stack([flat if found is None else found for found in told]) - 1
+        white = torch.tensor([scene.radiance_gain * state.gain for state in states], dtype=torch.float64)[:, None, None]
+        self.register_buffer("white", white, persistent=False)
         self.register_buffer("shading", torch.from_numpy(shading), persistent=False)  # a scene tells it again
         self.register_buffer("gain", self.shading.clone())
-        self.register_buffer("dark", torch.full(size, settings.dark / self.white))
+        self.register_buffer("dark", (settings.dark / white).float().repeat(1, *size[1:]))
         self.register_buffer("sums", torch.zeros(3, *size))
 
     def forward(self, render: Render, sample: Sample) -> Tensor:
@@ -99,7 +102,7 @@ class FixedPattern(Supervision):
 
     def estimates(self) -> dict[str, Tensor]:
         """Return the maps [C, H, W]: `gain` with mean 1 over each camera, `dark` in spikes per tick."""
-        return {"gain": 1 + self.gain, "dark": self.dark * self.white}
+        return {"gain": 1 + self.gain, "dark": self.dark * self.white.to(self.dark)}
 
     def _remember(self, rendered: Tensor, sample: Sample) -> None:
         chosen, seen = list(sample.views), sample.images.isfinite()
@@ -108,19 +111,20 @@ class FixedPattern(Supervision):
         self.sums[:, chosen] = self.sums[:, chosen] * kept + torch.where(seen, new, 0.0)
 
 
-def solve(sums: Tensor, shading: Tensor, s: FixedPatternSettings, white: float) -> tuple[Tensor, Tensor]:
+def solve(sums: Tensor, shading: Tensor, s: FixedPatternSettings, white: Tensor) -> tuple[Tensor, Tensor]:
     """Return the most probable gain γ and dark level d, [C, H, W] each, from sums [3, C, H, W]; see the module.
 
-    `shading` is s [C, H, W], `white` spikes per tick of white.
+    `shading` is s [C, H, W], `white` float64 [C, 1, 1] spikes per tick of white: dark levels are a sensor's own.
     """
     count, light, measured = sums
     seen = count > 0
     r, i = (torch.where(seen, total / count.clamp(min=1e-6), 0.0) for total in (light, measured))
-    own_gain, own_dark = s.pixel_gain**2 * r * r, (s.dark_spread / white) ** 2
-    own = torch.where(seen, i - r - s.dark / white - r * shading, 0.0)
+    typical, own_dark = (s.dark / white).to(r), ((s.dark_spread / white) ** 2).to(r)
+    own_gain = s.pixel_gain**2 * r * r
+    own = torch.where(seen, i - r - typical - r * shading, 0.0)
     excess = (own.square() - own_gain - own_dark) * seen
     around = [avg_pool2d(x.to(r), s.noise_px, 1, s.noise_px // 2) for x in (excess, seen)]
     noise = s.model_error**2 + (around[0] / around[1].clamp(min=1e-6)).clamp(min=0)
     variance = own_gain + own_dark + noise
     gain = shading + s.pixel_gain**2 * r * own / variance
-    return gain - gain.mean((1, 2), keepdim=True), s.dark / white + own_dark * own / variance
+    return gain - gain.mean((1, 2), keepdim=True), typical + own_dark * own / variance

@@ -14,6 +14,7 @@ from spike4dgs.method.supervision.table import SUPERVISIONS
 
 WORLD = ToyWorld(width=32, height=20, side=2, n_ticks=120)
 WHITE = WORLD.training.radiance_gain
+WHITES = torch.full((1, 1, 1), WHITE, dtype=torch.float64)  # of cameras of one gain
 SETTINGS = FixedPatternSettings(first=0, every=1)
 VIEWS, SIZE = len(WORLD.training.cameras), (20, 32)
 
@@ -70,7 +71,7 @@ def test_maps_are_those_of_ridge_regression(light: tuple[float, float], settings
     count = torch.from_numpy(rng.uniform(0.5, 20, r.shape))
     sums = torch.stack([count, count * torch.from_numpy(r), count * torch.from_numpy(i)])
     shading = 0.08 * rng.standard_normal(r.shape)
-    gain, dark = solve(sums.float(), torch.from_numpy(shading).float(), settings, WHITE)
+    gain, dark = solve(sums.float(), torch.from_numpy(shading).float(), settings, WHITES)
     for found, expected in zip((gain, dark), regression(r, i, shading, settings), strict=True):
         np.testing.assert_allclose(found.numpy(), expected, atol=2e-5)
 
@@ -80,7 +81,7 @@ def test_a_pixel_that_was_never_seen_has_the_shading_there_and_the_typical_dark_
     seen[0, 3:6, 4:9] = 0
     shading = torch.from_numpy(np.stack([0.08 * slope(*SIZE), -0.08 * slope(*SIZE)])).float()
     i = r * (1 + shading) + SETTINGS.dark / WHITE
-    gain, dark = solve(torch.stack([seen, seen * r, seen * i]), shading, SETTINGS, WHITE)
+    gain, dark = solve(torch.stack([seen, seen * r, seen * i]), shading, SETTINGS, WHITES)
     hole = seen[0] == 0
     np.testing.assert_allclose(gain[0][hole].numpy(), shading[0][hole].numpy(), atol=1e-6)
     np.testing.assert_allclose(dark[0][hole].numpy(), SETTINGS.dark / WHITE, rtol=1e-6)
@@ -94,6 +95,19 @@ def test_the_loss_begins_with_the_shadings_of_the_scene() -> None:
     found = loss.estimates()["gain"].numpy()
     np.testing.assert_allclose(found[1], told, rtol=1e-6)
     assert (found[0] == 1).all() and (found[2:] == 1).all()
+
+
+def test_a_camera_of_another_gain_has_the_same_dark_rates() -> None:
+    """Images are in white: at a third of the spikes of white the dark is three times as bright in them."""
+    gains = np.array([1.0, 1 / 3, 2.0])
+    states = {c.id: CameraState(gain=gain) for c, gain in zip(WORLD.training.cameras, gains, strict=True)}
+    loss = SUPERVISIONS["fixed-pattern"](SETTINGS, replace(WORLD.training, states=states))
+    np.testing.assert_allclose(loss.estimates()["dark"].numpy(), SETTINGS.dark, rtol=1e-6)
+    light, dark = torch.rand(VIEWS, *SIZE, generator=_seeded(0)), SETTINGS.dark / (WHITE * gains)
+    measured = light + torch.from_numpy(dark).float()[:, None, None]
+    loss(lambda t: light, Sample(0.5, 60, tuple(range(VIEWS)), measured, 0))
+    np.testing.assert_allclose(loss.estimates()["dark"].numpy(), SETTINGS.dark, rtol=1e-4)
+    np.testing.assert_allclose(loss.estimates()["gain"].numpy(), 1, atol=1e-5)
 
 
 def loss_of(settings: FixedPatternSettings) -> FixedPattern:
