@@ -23,7 +23,7 @@ from spike4dgs.method.images.local_light import shared
 from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.settings import Settings
 from spike4dgs.method.splat import Views
-from spike4dgs.method.training_views.training_images import Spans, TrainingImages, bad_pixels, missing_images
+from spike4dgs.method.training_views.training_images import Spans, TrainingImages, bad_pixels, fill_dead, missing_images
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,13 @@ def make_training_images(
     """Return images of all training views at the chosen times, at the streams' pixels; `cameras` have the fit's poses.
 
     `light` is what changes in the scene's light, if anything: makers that know of it show mean light. Where it is a
-    lamp's they show the light that there is, and the images say so.
+    lamp's they show the light that there is, and the images say so. A dead pixel, which has no value, counts as bad.
     """
     ticks, made, spans = _make(scene, make, settings, device, light)
+    dead, bad, missing = fill_dead(made), bad_pixels(scene), missing_images(scene, ticks)
     images = torch.from_numpy(made).to(device)
-    bad, missing = bad_pixels(scene), missing_images(scene, ticks)
-    masks = None if bad is None else torch.from_numpy(np.stack(bad)).to(device)
+    known_bad = [np.asarray(found) for found in (dead, bad) if found is not None]
+    masks = torch.from_numpy(np.logical_or.reduce(known_bad)).to(device) if known_bad else None
     lacking = None if missing is None else torch.from_numpy(missing).to(device)
     views, lamp = Views.from_cameras(cameras, device=device), light.factors if light and light.local else None
     return TrainingImages(views, ticks, images, scene.n_ticks, masks, lacking, spans, light=lamp)

@@ -10,9 +10,10 @@ from functools import cached_property, reduce
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.scene.camera_state import local_ticks
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.gaps import present
@@ -42,7 +43,7 @@ class TrainingImages:
     ticks: tuple[int, ...]  # ascending
     images: Tensor  # [T, C, H, W] linear radiance
     n_ticks: int  # length of the clip
-    bad: Tensor | None = None  # bool [C, H, W], bad pixels, whose values are a neighbour's; None: there are none
+    bad: Tensor | None = None  # bool [C, H, W], bad and dead pixels, with a neighbour's values; None: there are none
     missing: Tensor | None = None  # bool [T, C], images where a recording lacks most ticks; None: there are none
     spans: Spans | None = None  # of [T, C]; None: the images show instants
     exposure_ticks: int = 0  # that images of another sensor are means over, from tick - exposure_ticks // 2 on
@@ -88,6 +89,21 @@ def bad_pixels(scene: TrainingScene) -> list[NDArray[np.bool_]] | None:
     if all(mask is None for mask in masks):
         return None
     return [np.zeros((s.height, s.width), bool) if m is None else m for m, s in zip(masks, scene.streams, strict=True)]
+
+
+def fill_dead(images: Float32) -> NDArray[np.bool_] | None:
+    """Give the pixels of images [T, C, H, W] that are no number at some time the values of the nearest ones, in place.
+
+    Return these pixels, [C, H, W]; None where there are none. A camera without any other pixel keeps its values.
+    """
+    dead = np.stack([~np.isfinite(own).all(0) for own in images.swapaxes(0, 1)])
+    if not dead.any():
+        return None
+    for own, mask in zip(images.swapaxes(0, 1), dead, strict=True):
+        if mask.any() and not mask.all():
+            rows, columns = distance_transform_edt(mask, return_distances=False, return_indices=True)[:, mask]
+            own[:, mask] = own[:, rows, columns]
+    return dead
 
 
 def missing_images(scene: TrainingScene, ticks: Sequence[int]) -> NDArray[np.bool_] | None:

@@ -20,6 +20,7 @@ from spike4dgs.method.starts.rig import RigSettings, rig
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras
 
 GAIN, TICKS = 0.6, 200
+ADAPTIVE = IMAGES["adaptive"]
 
 
 def light(camera):
@@ -37,12 +38,12 @@ def scene() -> TrainingScene:
     return uneven_scene()
 
 
-def uneven_scene(dead_ticks: float = 0.0, light=light, n_ticks: int = TICKS) -> TrainingScene:
-    """Cameras of uneven pixels in front of a soft gradient of light, or of another light."""
+def uneven_scene(dead_ticks: float = 0.0, light=light, n_ticks: int = TICKS, alive=1) -> TrainingScene:
+    """Cameras of uneven pixels in front of a soft gradient of light, or of another one; dead where not `alive`."""
     cameras, streams, recordings = array_cameras(), [], []
     for i, camera in enumerate(cameras):
         pixels = camera.height, camera.width, 0, camera.id
-        sensor = Sensor(GAIN, 1.1 * gain_map(*pixels), 4 * dark_map(*pixels), dead_ticks=dead_ticks)
+        sensor = Sensor(GAIN, 1.1 * alive * gain_map(*pixels), 4 * alive * dark_map(*pixels), dead_ticks=dead_ticks)
         streams.append(record(camera, sensor, light(camera), n_ticks, i))
         flat, dark = record(camera, sensor, 0.7, 500, i), record(camera, sensor, 0.0, 2000, i)
         recordings.append(Recordings(flat, dark, 0.7))
@@ -50,7 +51,7 @@ def uneven_scene(dead_ticks: float = 0.0, light=light, n_ticks: int = TICKS) -> 
 
 
 def error(scene, **settings):
-    made = make_training_images(scene, scene.cameras, IMAGES["adaptive"], ImageSettings(**settings), "cpu")
+    made = make_training_images(scene, scene.cameras, ADAPTIVE, ImageSettings(**settings), "cpu")
     truth = np.stack([light(c) for c in scene.cameras])
     return float(np.sqrt(np.mean((made.images.numpy() - truth) ** 2)))
 
@@ -58,6 +59,21 @@ def error(scene, **settings):
 def test_images_lose_the_pattern_of_the_pixels(scene):
     assert error(scene) > 0.04
     assert error(scene, flat_field=True) < 0.008
+
+
+def test_a_dead_pixel_has_the_values_of_a_neighbour_and_is_no_measurement(scene):
+    """Optical flow and all that blurs would spread a value that is no number; a loss leaves the pixel out."""
+    dead = np.zeros((scene.cameras[0].height, scene.cameras[0].width), bool)
+    dead[[0, 9, 9], [3, 20, 21]] = True
+    uneven, settings = uneven_scene(alive=~dead), ImageSettings(flat_field=True)
+    made = make_training_images(uneven, uneven.cameras, ADAPTIVE, settings, "cpu")
+    images = made.images.numpy()
+    assert np.isfinite(images).all() and (made.bad.numpy() == dead).all()
+    for y, x in np.argwhere(dead):
+        around = [p for p in ((y, x - 1), (y, x + 1), (y - 1, x), (y + 1, x)) if not dead[p]]
+        assert all(any((own[:, y, x] == own[:, *p]).all() for p in around) for own in images.swapaxes(0, 1))
+    assert (made.measured(3).isfinite().numpy() == ~dead).all()
+    assert make_training_images(scene, scene.cameras, ADAPTIVE, settings, "cpu").bad is None
 
 
 def test_without_recordings_images_stay_as_they_are(scene):
