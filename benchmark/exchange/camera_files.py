@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -46,21 +47,37 @@ def read_camchain(path: Path, size: tuple[int, int]) -> dict[str, FoundCamera]:
     """
     chain: dict[Any, Any] = read_yaml(path, _WHAT)
     found, w2c = {}, np.eye(4)
-    for i, (name, entry) in enumerate(sorted(chain.items(), key=lambda item: (len(str(item[0])), str(item[0])))):
+    order = _chain_order(list(chain))
+    for i, name in enumerate(order):
+        entry = chain[name]
         try:
             model, intrinsics, resolution = entry["camera_model"], entry["intrinsics"], entry["resolution"]
             if i:
                 w2c = np.asarray(entry["T_cn_cnm1"], np.float64).reshape(4, 4) @ w2c
             lens, coefficients = entry["distortion_model"], np.asarray(entry["distortion_coeffs"], np.float64)
         except (KeyError, TypeError, ValueError) as e:
-            expected = f"{_KEYS} and, after the first, a 4x4 T_cn_cnm1 of {name}"
-            raise problem(path, expected, repr(e), "calibrate again") from None
+            expected = f"{_KEYS} and, after {order[0]}, the first, a 4x4 T_cn_cnm1 of {name}"
+            reason = f"no {e}" if isinstance(e, KeyError) else repr(e)
+            fix = "put the cameras in the chain's order, or calibrate again"
+            raise problem(path, expected, reason, fix) from None
         if model != "pinhole":
             raise problem(path, f"camera_model pinhole of {name}", repr(model), "calibrate with that model")
         check_size(tuple(resolution) if isinstance(resolution, list) else (resolution,), size, str(name), path)
         camera = make_camera(str(name), size, intrinsics, w2c[:3, :3], w2c[:3, 3], path, CENTRE)
         found[str(name)] = _with_distortion(camera, lens, coefficients, path)
     return found
+
+
+def _chain_order(names: list[Any]) -> list[Any]:
+    """Return names in the order of their chain: by number where all are one text and a number, else the file's.
+
+    Writers of YAML put `cam10` before `cam2`; the names of renamed cameras say nothing of their order.
+    """
+    matched = ((re.fullmatch(r"(.*?)([0-9]{1,9})", str(name)), name) for name in names)
+    numbered = [(match[1], int(match[2]), name) for match, name in matched if match]
+    if len(numbered) < len(names) or len({prefix for prefix, *_ in numbered}) > 1:
+        return names
+    return [name for *_, name in sorted(numbered, key=lambda row: row[1])]
 
 
 def _with_distortion(camera: Camera, lens: Any, coefficients: Any, path: Path) -> FoundCamera:

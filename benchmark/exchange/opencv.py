@@ -5,7 +5,8 @@ One file holds one camera, named like the file, or a map for each camera, named 
     camera_matrix, distortion_coefficients (optional), R (3x3, or a rotation vector), T, image_width, image_height
 
 with x_cam = R x_world + T, as from `calibrateCamera`, `solvePnP` and `stereoCalibrate`. Size is optional. Keys of
-other programs are known too: `K` or `cameraMatrix`, `D` or `distCoeffs`, `rvec`, `t` or `tvec`.
+other programs are known too: `K` or `cameraMatrix`, `D` or `distCoeffs`, `rvec`, `t` or `tvec`. The coefficients are a
+fisheye's where `fisheye_model` (OpenCV's calibration sample) or `distortion_model` (ROS) says so.
 """
 
 from __future__ import annotations
@@ -18,8 +19,16 @@ import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.exchange.foreign_camera import CENTRE, FoundCamera, check_size, make_camera, with_brown_lens
+from spike4dgs.benchmark.exchange.foreign_camera import (
+    CENTRE,
+    FoundCamera,
+    check_size,
+    fisheye_distortion,
+    make_camera,
+    with_brown_lens,
+)
 from spike4dgs.benchmark.files import read_text
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.untrusted import parse_yaml, shown, whole
 
 if TYPE_CHECKING:
@@ -38,6 +47,9 @@ _TYPES = ("d", "f", "i", "u", "w", "s", "c")  # of matrices of one channel
 _MOST_VALUES = 100  # of a matrix of a camera
 _DEPTH = 16  # of maps and lists in XML
 _COEFFICIENTS = (4, 5, 8, 12, 14)  # that OpenCV's lens model takes
+_NO_FISHEYE = (None, 0, "0")  # values of `fisheye_model`
+_FISHEYES = ("equidistant", "fisheye")  # values of `distortion_model`
+_EXACT = 1e-9  # of the entries of a camera matrix that are 0 or 1
 
 
 def read_opencv_files(paths: list[Path], size: tuple[int, int]) -> dict[str, FoundCamera]:
@@ -137,21 +149,35 @@ def _camera(name: str, node: Values, size: tuple[int, int], path: Path) -> Found
     import cv2
 
     K, R, t = (_matrix(node, keys, name, path) for keys in (_MATRIX, _ROTATION, _TRANSLATION))
-    if K.shape != (3, 3) or abs(K[0, 1]) > 1e-9 or R.size not in (3, 9):
+    if K.shape != (3, 3) or not _is_plain(K) or R.size not in (3, 9):
         found = f"{shown(K.tolist())} and {R.size} values"
-        raise problem(path, f"a 3x3 matrix without skew and 9 or 3 values of R for {name}", found, "calibrate again")
+        expected = f"a 3x3 matrix (fx, 0, cx; 0, fy, cy; 0, 0, 1) and 9 or 3 values of R for {name}"
+        raise problem(path, expected, found, "calibrate again")
     width, height = (_side(node, f"image_{key}", path) for key in ("width", "height"))
     if width is not None and height is not None:
         check_size((width, height), size, name, path)
     intrinsics = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     rotation = cv2.Rodrigues(R.reshape(3))[0] if R.size == 3 else R
-    camera = make_camera(name, size, intrinsics, rotation, t, path, CENTRE)
+    return _with_lens(make_camera(name, size, intrinsics, rotation, t, path, CENTRE), node, path)
+
+
+def _is_plain(K: Float64) -> bool:
+    """Return whether a camera matrix [3, 3] has no skew and is neither transposed nor scaled."""
+    fixed = np.array([K[0, 1], K[1, 0], K[2, 0], K[2, 1], K[2, 2] - 1])
+    return bool((np.abs(fixed) <= _EXACT).all())
+
+
+def _with_lens(camera: Camera, node: Values, path: Path) -> FoundCamera:
+    fisheye = node.get("fisheye_model") not in _NO_FISHEYE or node.get("distortion_model") in _FISHEYES
     if _get(node, _DISTORTION) is None:
-        return FoundCamera(camera)
-    coefficients = _matrix(node, _DISTORTION, name, path).ravel()
-    if len(coefficients) not in _COEFFICIENTS:
-        expected = f"{', '.join(map(str, _COEFFICIENTS))} {_DISTORTION[0]} of {name}"
+        return FoundCamera(camera, fisheye_distortion(np.zeros(4)) if fisheye else None)
+    coefficients = _matrix(node, _DISTORTION, camera.id, path).ravel()
+    counts = (4,) if fisheye else _COEFFICIENTS
+    if len(coefficients) not in counts:
+        expected = f"{', '.join(map(str, counts))} {_DISTORTION[0]} of {camera.id}"
         raise problem(path, expected, str(len(coefficients)), "write OpenCV's own")
     if not np.isfinite(coefficients).all():
-        raise problem(path, f"finite {_DISTORTION[0]} of {name}", "others", "calibrate again")
+        raise problem(path, f"finite {_DISTORTION[0]} of {camera.id}", "others", "calibrate again")
+    if fisheye:
+        return FoundCamera(camera, fisheye_distortion(coefficients))
     return with_brown_lens(camera, coefficients)

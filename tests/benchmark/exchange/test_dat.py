@@ -54,12 +54,15 @@ def opencv_matrix(c: Camera) -> np.ndarray:
     return c.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
-def write_opencv(path: Path, distortion: np.ndarray | None = None, leave_out: str = "", vector: bool = False) -> Path:
+def write_opencv(
+    path: Path, distortion: np.ndarray | None = None, leave_out: str = "", vector: bool = False, **more: Any
+) -> Path:
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for c in CAMERAS:
         R = cv2.Rodrigues(c.R)[0] if vector else c.R
         values = {"camera_matrix": opencv_matrix(c), "R": R, "T": c.t.reshape(3, 1), "image_width": c.width}
         values |= {"image_height": c.height} | ({} if distortion is None else {"distortion_coefficients": distortion})
+        values |= more
         file.startWriteStruct(c.id, cv2.FILE_NODE_MAP)
         for key, value in values.items():
             if key != leave_out:
@@ -69,21 +72,28 @@ def write_opencv(path: Path, distortion: np.ndarray | None = None, leave_out: st
     return path
 
 
-def write_kalibr(path: Path, lens: str = "radtan", coefficients: Sequence[float] = (0, 0, 0, 0), **more: Any) -> Path:
+def write_kalibr(
+    path: Path,
+    lens: str = "radtan",
+    coefficients: Sequence[float] = (0, 0, 0, 0),
+    names: Sequence[str] = tuple(c.id for c in CAMERAS),
+    sort_keys: bool = True,
+    **more: Any,
+) -> Path:
     chain: dict[str, Any] = {}
-    for i, c in enumerate(CAMERAS):
+    for i, (name, c) in enumerate(zip(names, CAMERAS, strict=True)):
         K = opencv_matrix(c)
-        chain[c.id] = {
+        chain[name] = {
             "camera_model": "pinhole",
             "intrinsics": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
             "distortion_model": lens,
             "distortion_coeffs": list(coefficients),
             "resolution": [c.width, c.height],
-            "rostopic": f"/{c.id}/image_raw",
+            "rostopic": f"/{name}/image_raw",
         } | more
         if i:
-            chain[c.id]["T_cn_cnm1"] = (c.w2c @ CAMERAS[i - 1].c2w).tolist()
-    path.write_text(yaml.safe_dump(json.loads(json.dumps(chain, default=float))))
+            chain[name]["T_cn_cnm1"] = (c.w2c @ CAMERAS[i - 1].c2w).tolist()
+    path.write_text(yaml.safe_dump(json.loads(json.dumps(chain, default=float)), sort_keys=sort_keys))
     return path
 
 
@@ -124,7 +134,7 @@ def test_images_of_a_colmap_camera_agree(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", ["yml", "yaml", "xml"])
 def test_opencv_cameras(tmp_path: Path, suffix: str) -> None:
     write_streams(tmp_path / "in", [c.id for c in CAMERAS])
-    path = write_opencv(tmp_path / f"cameras.{suffix}", SLIGHT * 0, vector=suffix == "xml")
+    path = write_opencv(tmp_path / f"cameras.{suffix}", SLIGHT * 0, vector=suffix == "xml", fisheye_model=0)
     import_dat(tmp_path / "in", **STATED, cameras=path, out=tmp_path / "out")
     cameras = open_scene(tmp_path / "out").cameras
     for c in CAMERAS:
@@ -146,14 +156,22 @@ def test_a_folder_of_opencv_files_has_one_camera_each(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.K, c.K, atol=1e-9)
 
 
-def test_kalibr_cameras_are_seen_from_the_first(tmp_path: Path) -> None:
-    write_streams(tmp_path / "in", [c.id for c in CAMERAS])
-    import_dat(tmp_path / "in", **STATED, cameras=write_kalibr(tmp_path / "camchain.yaml"), out=tmp_path / "out")
+@pytest.mark.parametrize(
+    ("names", "sort_keys"), [(("cam0", "cam2", "cam10"), True), (("left", "right-far", "right"), False)]
+)
+def test_kalibr_cameras_are_seen_from_the_first(tmp_path: Path, names: tuple[str, ...], sort_keys: bool) -> None:
+    """Names of one text and a number are in order; of others the file's order is the chain's."""
+    write_streams(tmp_path / "in", names)
+    chain = write_kalibr(tmp_path / "camchain.yaml", names=names, sort_keys=sort_keys)
+    import_dat(tmp_path / "in", **STATED, cameras=chain, out=tmp_path / "out")
     cameras = open_scene(tmp_path / "out").cameras
-    np.testing.assert_allclose(cameras["cam_00"].w2c, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(cameras[names[0]].w2c, np.eye(4), atol=1e-12)
     first = POINTS @ CAMERAS[0].R.T + CAMERAS[0].t  # the points in the first camera's coordinates
-    for c in CAMERAS:
-        assert np.abs(cameras[c.id].project(first)[0] - c.project(POINTS)[0]).max() < 1e-6
+    for name, c in zip(names, CAMERAS, strict=True):
+        assert np.abs(cameras[name].project(first)[0] - c.project(POINTS)[0]).max() < 1e-6
+    unordered = write_kalibr(tmp_path / "other.yaml", names=("right", "left", "up"))
+    with pytest.raises(UserError, match="after left, the first, a 4x4 T_cn_cnm1 of right, found no 'T_cn_cnm1'; put"):
+        import_dat(tmp_path / "in", **STATED, cameras=unordered, out=tmp_path / "other")
 
 
 @pytest.mark.parametrize("kind", ["colmap", "opencv", "kalibr"])
@@ -200,6 +218,14 @@ def test_other_lenses_are_refused(tmp_path: Path) -> None:
     fisheye = write_kalibr(tmp_path / "camchain.yaml", "equidistant")
     with pytest.raises(UserError, match=f"found another one, with {expected:.2f} px, in cam_00"):
         import_dat(tmp_path / "in", **STATED, cameras=fisheye, out=tmp_path / "out")
+    for facts in ({"fisheye_model": 1}, {"distortion_model": "equidistant"}, {"fisheye_model": 1, "D": np.zeros(4)}):
+        for suffix in ("yml", "xml"):
+            fisheye = write_opencv(tmp_path / f"fisheye.{suffix}", **facts)
+            with pytest.raises(UserError, match=f"found another one, with {expected:.2f} px, in cam_00"):
+                import_dat(tmp_path / "in", **STATED, cameras=fisheye, out=tmp_path / "out")
+    five = write_opencv(tmp_path / "five.yml", np.zeros(5), fisheye_model=1)
+    with pytest.raises(UserError, match="expected 4 distortion_coefficients of cam_00, found 5"):
+        import_dat(tmp_path / "in", **STATED, cameras=five, out=tmp_path / "out")
     rational = write_opencv(tmp_path / "rational.yml", np.array([0.1, 0, 0, 0, 0, 0.3, 0, 0]))
     with pytest.raises(UserError, match=r"expected OpenCV's lens model \(k1, k2, p1, p2, k3\)"):
         import_dat(tmp_path / "in", **STATED, cameras=rational, out=tmp_path / "out")
@@ -305,6 +331,14 @@ def test_images_with_points_are_read_without_them(tmp_path: Path) -> None:
         import_dat(tmp_path / "in", **STATED, cameras=folder, out=tmp_path / f"{kind}-out")
         found = open_scene(tmp_path / f"{kind}-out").cameras["cam_00"]
         np.testing.assert_allclose(found.w2c, CAMERAS[0].w2c, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [opencv_matrix(CAMERAS[0]).T.copy(), 2 * opencv_matrix(CAMERAS[0])])
+def test_camera_matrices_of_other_conventions_are_refused(tmp_path: Path, wrong: np.ndarray) -> None:
+    write_streams(tmp_path / "in", ["cam_00"])
+    path = write_opencv(tmp_path / "cameras.yml", camera_matrix=wrong)
+    with pytest.raises(UserError, match=r"expected a 3x3 matrix \(fx, 0, cx; 0, fy, cy; 0, 0, 1\) .* for cam_00"):
+        import_dat(tmp_path / "in", **STATED, cameras=path, out=tmp_path / "out")
 
 
 @pytest.mark.parametrize("facts", ["rows: 3, dt: d", "rows: 3, cols: 900000000, dt: d", "rows: 3, cols: 3, dt: 3d"])
