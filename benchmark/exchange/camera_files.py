@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -108,13 +108,13 @@ def read_camera_files(path: Path, names: Sequence[str], size: tuple[int, int]) -
         known = ", ".join(sorted(found)) or "none"
         fix = "name the streams' files as the cameras are called"
         raise problem(path, "a camera for each stream", f"none for {', '.join(missing)} (it has {known})", fix)
-    cameras = tuple(_with_lens(path, found[name]) for name in names)
+    cameras = tuple(_with_lens(path, camera) for name in names if (camera := found[name]))
     if others := sorted(set(found) - set(names)):
         print(f"{path}: no stream of {', '.join(others)}: left out")
     return cameras
 
 
-def _read(path: Path, names: Sequence[str], size: tuple[int, int]) -> dict[str, FoundCamera]:
+def _read(path: Path, names: Sequence[str], size: tuple[int, int]) -> Mapping[str, FoundCamera | None]:
     if path.is_dir():
         files = sorted(p for p in path.iterdir() if p.suffix in SUFFIXES)
         return read_opencv_files(files, size) if files else read_colmap_model(path, names, size)

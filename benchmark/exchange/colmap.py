@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,22 +12,20 @@ import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.exchange.foreign_camera import Distort, FoundCamera, check_size, make_camera
-from spike4dgs.benchmark.scene.lens import NAMES
+from spike4dgs.benchmark.exchange.foreign_camera import Distort, FoundCamera, check_same, check_size, make_camera
 from spike4dgs.benchmark.scene.writer import colmap_distortion
 
 _MOST_BYTES = 1 << 28  # of cameras or images, these with their points
 _CAMERA_BYTES = 48  # at least, in cameras.bin
 _POSE_BYTES, _POINT_BYTES = 64, 24  # in images.bin: before the name of an image, and of each of its points
-_SAME = 1e-9  # relative: images of one camera that have the same pose
 
 
-def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int]) -> dict[str, FoundCamera]:
+def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int]) -> Mapping[str, FoundCamera | None]:
     """Return the cameras of a model's registered images, by the stream that an image belongs to.
 
     An image belongs to the stream of its name, with or without suffix, or of its folder: `cam_00`, `cam_00.png`,
-    `cam_00/000120.png`. Images without a stream are left out. Raises UserError where the model cannot be read, and
-    where images of one stream have different cameras.
+    `cam_00/000120.png`. For images without a stream there is None. Raises UserError where the model cannot be read,
+    and where images of one stream have different cameras.
     """
     import pycolmap
 
@@ -40,16 +38,16 @@ def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int
     except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as e:
         raise problem(folder, "a whole COLMAP model", f"a damaged one ({str(e)[:200]})", "export it again") from None
     found: dict[str, FoundCamera] = {}
+    others = set()
     for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
-        name, camera = _stream_of(image.name, names), model.cameras[image.camera_id]
-        if name in names:
-            check_size((camera.width, camera.height), size, name, folder)
+        if (name := _stream_of(image.name, names)) not in names:
+            others.add(name)
+            continue
+        camera = model.cameras[image.camera_id]
+        check_size((camera.width, camera.height), size, name, folder)
         made = _camera(name, image, camera, folder)
-        first = found.setdefault(name, made)
-        if name in names and not _equal(first, made):
-            fix = "export a model in which each camera stands still and has one set of intrinsics"
-            raise problem(folder, f"one camera and pose for all images of {name}", f"another in {image.name}", fix)
-    return found
+        check_same(found.setdefault(name, made), made, image.name, folder)
+    return {**dict.fromkeys(others), **found}
 
 
 def _write_cameras_and_poses(folder: Path, out: Path) -> None:
@@ -93,7 +91,7 @@ def _text_poses(data: bytes) -> bytes:
 def _stream_of(image: str, names: Collection[str]) -> str:
     """Return the stream of an image; where there is none, the image's folder, or its name without suffix."""
     path = PurePosixPath(image)
-    candidates = (image, path.with_suffix("").as_posix(), path.stem, path.parts[0])
+    candidates = (image, (path.parent / path.stem).as_posix(), path.stem, *path.parts[:1])
     other = path.parts[0] if len(path.parts) > 1 else path.stem
     return next((name for name in candidates if name in names), other)
 
@@ -117,14 +115,3 @@ def _distortion(camera: Any, intrinsics: tuple[float, float, float, float]) -> D
         return np.asarray((uv - (cx, cy)) / (fx, fy))
 
     return distort
-
-
-def _equal(a: FoundCamera, b: FoundCamera) -> bool:
-    """Return whether two cameras have the same intrinsics and pose, and as much distortion."""
-
-    def numbers(f: FoundCamera) -> Float64:
-        lens = f.camera.distortion or (0.0,) * len(NAMES)
-        return np.concatenate([f.camera.K.ravel(), f.camera.w2c.ravel(), lens, [f.distortion_px]])
-
-    first, second = numbers(a), numbers(b)
-    return bool(np.allclose(first, second, rtol=_SAME, atol=_SAME))

@@ -5,14 +5,14 @@ No header, 1 bit per pixel, row-major, least significant bit first; a tick takes
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.camera_files import read_camera_files
-from spike4dgs.benchmark.exchange.recording import Recording, stream_path, write_recording
-from spike4dgs.benchmark.files import check_new
-from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream
+from spike4dgs.benchmark.exchange.recording import Recording, Source, write_recording
+from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 from spike4dgs.benchmark.untrusted import MAX_SIDE, check_ids
 
 _TICKS = 4096  # copied at a time
@@ -31,13 +31,10 @@ def import_dat(
         raise problem("--width and --height", f"at most {MAX_SIDE}", f"{width}, {height}", "correct it")
     files = {file.stem: file for file in _dat_files(path)}
     check_ids(files, "camera", path, "rename the .dat file, after which the camera is called")
-    rate_hz, bottom_up = recording.rate_hz, not recording.rows_top_down
-    sources = {n: open_stream(file, width, height, rate_hz, rows_bottom_up=bottom_up) for n, file in files.items()}
-    found = None if cameras is None else _cameras(cameras, sources, (width, height))
-    check_new(out)
-    streams = {name: _copied(source, stream_path(out, name, found)) for name, source in sources.items()}
-    write_recording(out, streams, found, recording, "dat")
-    return streams
+    sources = {name: open_stream(file, width, height, recording.rate_hz) for name, file in files.items()}
+    found = None if cameras is None else read_camera_files(cameras, sorted(sources), (width, height))
+    read = {name: Source(width, height, stream.n_ticks, _parts(stream)) for name, stream in sources.items()}
+    return write_recording(out, read, found, recording, "dat")
 
 
 def _dat_files(path: Path) -> list[Path]:
@@ -50,18 +47,5 @@ def _dat_files(path: Path) -> list[Path]:
     return found
 
 
-def _cameras(path: Path, sources: dict[str, SpikeStream], size: tuple[int, int]) -> tuple[Camera, ...]:
-    """Return the cameras of a scene's streams. Raises UserError also where these are not of one length."""
-    lengths = sorted({s.n_ticks for s in sources.values()})
-    if len(lengths) > 1:
-        found = " and ".join(f"{n} ticks" for n in lengths)
-        raise problem("streams", "one length for one scene", found, "cut them to one length")
-    return read_camera_files(path, sorted(sources), size)
-
-
-def _copied(source: SpikeStream, target: Path) -> SpikeStream:
-    with SpikeWriter(target, source.width, source.height) as writer:
-        for start in range(0, source.n_ticks, _TICKS):
-            writer.write(source.packed[start : start + _TICKS])
-    bottom_up = source.rows_bottom_up
-    return open_stream(target, source.width, source.height, source.rate_hz, rows_bottom_up=bottom_up)
+def _parts(stream: SpikeStream) -> Iterator[UInt8]:
+    return (stream.packed[start : start + _TICKS] for start in range(0, stream.n_ticks, _TICKS))

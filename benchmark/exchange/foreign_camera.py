@@ -17,6 +17,7 @@ from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
 Distort = Callable[[Float64], Float64]  # normalised image coordinates [N, 2] of a pinhole -> of the lens
 
 CENTRE = 0.5  # added to principal points of OpenCV and Kalibr, whose pixel centres are at whole numbers
+_SAME = 1e-9  # relative: images of one camera that have the same pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,19 @@ def check_size(found: Any, size: tuple[int, int], name: str, where: Path) -> Non
     if found != size:
         expected = f"{size[0]}x{size[1]} pixels for {name}, as the streams have"
         raise problem(where, expected, "x".join(map(str, found)), "correct --width and --height, or calibrate again")
+
+
+def check_same(first: FoundCamera, found: FoundCamera, image: str, where: Path) -> None:
+    """Raise UserError unless an image's camera has the intrinsics, the lens and the pose of an earlier image's."""
+
+    def numbers(f: FoundCamera) -> Float64:
+        c = f.camera
+        lens = c.distortion or (0.0,) * len(NAMES)
+        return np.array([c.width, c.height, *c.K.ravel(), *c.w2c.ravel(), *lens, f.distortion_px])
+
+    if not np.allclose(numbers(first), numbers(found), rtol=_SAME, atol=_SAME):
+        fix = "export one in which each camera stands still and has one set of intrinsics"
+        raise problem(where, f"one camera and pose for all images of {first.camera.id}", f"another in {image}", fix)
 
 
 def with_brown_lens(camera: Camera, coefficients: Float64) -> FoundCamera:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import check_new
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.folder import write_stream_folder
-from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.untrusted import MAX_GAIN, MAX_HZ
+from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream
+from spike4dgs.benchmark.untrusted import MAX_GAIN, MAX_HZ, check_ids
 
 
 @dataclass(frozen=True)
@@ -42,22 +44,50 @@ class Recording:
                 raise problem(name, expected, "none", f"add {option}, or leave {name} out")
 
 
-def stream_path(out: Path, camera: str, cameras: tuple[Camera, ...] | None) -> Path:
-    """Return where a stream lies in the folder that `write_recording` describes."""
-    return out / (f"{camera}.dat" if cameras is None else stream_name(camera))
+@dataclass(frozen=True)
+class Source:
+    """A stream of another program's file: its size in pixels, its length, and its ticks in our layout."""
+
+    width: int
+    height: int
+    n_ticks: int
+    parts: Iterable[UInt8]  # some ticks at a time, packed
 
 
 def write_recording(
-    out: Path, streams: Mapping[str, SpikeStream], cameras: tuple[Camera, ...] | None, recording: Recording, kind: str
-) -> None:
-    """Describe streams that are already in `out`: without cameras as a folder of streams, with them as a scene.
+    out: Path, sources: Mapping[str, Source], cameras: tuple[Camera, ...] | None, recording: Recording, kind: str
+) -> dict[str, SpikeStream]:
+    """Copy streams by camera to a new folder, of streams or with cameras a scene, and return them.
 
-    A scene's streams have one length; it has no truth, and all its cameras train. `kind` is the source in its
-    description.
+    A scene has no truth, and all its cameras train. `kind` is the source in its description. Raises UserError before
+    anything is written where the folder is not new or its name is no scene's, and where a scene's streams differ in
+    size or length.
     """
+    if cameras is not None:
+        check_ids([out.resolve().name], "scene", "--out", "choose another name")
+        shapes = sorted({(s.width, s.height, s.n_ticks) for s in sources.values()})
+        if len(shapes) > 1:
+            found = " and ".join(f"{w}x{h}x{n}" for w, h, n in shapes)
+            raise problem("streams", "one size and length for one scene", found, "cut them to one length")
+    check_new(out)
+    streams = {}
+    for camera, source in sources.items():
+        target = out / (f"{camera}.dat" if cameras is None else stream_name(camera))
+        with SpikeWriter(target, source.width, source.height) as writer:
+            for packed in source.parts:
+                writer.write(packed)
+        rate_hz, bottom_up = recording.rate_hz, not recording.rows_top_down
+        streams[camera] = open_stream(target, source.width, source.height, rate_hz, rows_bottom_up=bottom_up)
     if cameras is None:
         write_stream_folder(out, streams, {"source": {"kind": kind}})
-        return
+    else:
+        _write_scene(out, streams, cameras, recording, kind)
+    return streams
+
+
+def _write_scene(
+    out: Path, streams: Mapping[str, SpikeStream], cameras: tuple[Camera, ...], recording: Recording, kind: str
+) -> None:
     first = streams[cameras[0].id]
     name = out.resolve().name
     finish_scene(

@@ -21,11 +21,12 @@ import numpy as np
 
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.exchange.recording import Recording, stream_path, write_recording
+from spike4dgs.benchmark.exchange.foreign_camera import FoundCamera, check_same
+from spike4dgs.benchmark.exchange.recording import Recording, Source, write_recording
 from spike4dgs.benchmark.files import atomic_path, check_new, read_json, write_text
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream
+from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.untrusted import MAX_SIDE, check_ids, inside, read_yaml, shown
 
 CONFIG = "config.yaml"
@@ -56,16 +57,8 @@ def import_spikecv(
     sources = _find_sources(folder)
     check_ids(sources, "camera", folder, "rename the camera's folder")
     cameras = None if transforms is None else _read_poses(transforms, sources)
-    check_new(out)
-    streams = {}
-    for camera, source in sources.items():
-        target, size = stream_path(out, camera, cameras), (source.width, source.height)
-        with SpikeWriter(target, *size) as writer:
-            for packed in _read_ticks(source):
-                writer.write(packed)
-        streams[camera] = open_stream(target, *size, recording.rate_hz, rows_bottom_up=not recording.rows_top_down)
-    write_recording(out, streams, cameras, recording, "spikecv")
-    return streams
+    read = {name: Source(s.width, s.height, s.n_ticks, _read_ticks(s)) for name, s in sources.items()}
+    return write_recording(out, read, cameras, recording, "spikecv")
 
 
 def export_spikecv(scene: Scene, out: Path) -> None:
@@ -169,29 +162,31 @@ _LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # 
 def _read_poses(path: Path, sources: dict[str, _Source]) -> tuple[Camera, ...]:
     """Read a camera for each stream; intrinsics are given at each frame or once at the top, as nerfstudio allows.
 
-    Raises UserError where a stream has no pose, or the streams do not fit the poses or each other.
+    Frames without a stream are left out. Raises UserError where a stream has no pose or several, or another size.
     """
     data = read_json(path, "camera poses")
     listed = data.get("frames", [])
     if not isinstance(listed, list) or not all(isinstance(frame, dict) for frame in listed):
         raise problem(path, "a list `frames` of objects", "another value", "correct the file")
-    frames: list[dict[str, Any]] = [{**data, **frame} for frame in listed]
-    for frame in frames:
-        model, more = str(frame.get("camera_model", "OPENCV")), [k for k in ("k4", "k5", "k6") if frame.get(k)]
-        if model not in _LENSES or more:
-            fix = "calibrate with OpenCV's first five coefficients"
-            raise problem(path, f"a camera_model of {', '.join(_LENSES)}", f"{model} {' '.join(more)}".strip(), fix)
-    cameras = {str(f.get("camera")): from_nerfstudio(str(f.get("camera")), f, str(path)) for f in frames}
-    missing = sorted(set(sources) - set(cameras))
-    if missing:
-        found = f"none for {', '.join(missing)} (it has {', '.join(sorted(cameras)) or 'no frames'})"
+    named = [(str(frame.get("camera")), {**data, **frame}) for frame in listed]
+    if missing := sorted(set(sources) - {name for name, _ in named}):
+        found = f"none for {', '.join(missing)} (it has {', '.join(sorted({n for n, _ in named})) or 'no frames'})"
         raise problem(path, 'a frame with "camera" for each folder', found, "rename the folders or add the frames")
+    cameras: dict[str, Camera] = {}
+    for i, (name, frame) in enumerate(named):
+        if name in sources:
+            made = _read_frame(name, frame, path)
+            check_same(FoundCamera(cameras.setdefault(name, made)), FoundCamera(made), f"frame {i}", path)
     for name, source in sources.items():
         if (cameras[name].width, cameras[name].height) != (source.width, source.height):
             found = f"{cameras[name].width}x{cameras[name].height}"
             raise problem(path, f"{source.width}x{source.height} pixels for {name}", found, "correct w and h")
-    shapes = sorted({(s.width, s.height, s.n_ticks) for s in sources.values()})
-    if len(shapes) > 1:
-        found = " and ".join(f"{w}x{h}x{n}" for w, h, n in shapes)
-        raise problem(path, "streams of one size and length for one scene", found, "cut them to one length")
     return tuple(cameras[name] for name in sorted(sources))
+
+
+def _read_frame(name: str, frame: dict[str, Any], path: Path) -> Camera:
+    model, more = str(frame.get("camera_model", "OPENCV")), [k for k in ("k4", "k5", "k6") if frame.get(k)]
+    if model not in _LENSES or more:
+        fix = "calibrate with OpenCV's first five coefficients"
+        raise problem(path, f"a camera_model of {', '.join(_LENSES)}", f"{model} {' '.join(more)}".strip(), fix)
+    return from_nerfstudio(name, frame, str(path))

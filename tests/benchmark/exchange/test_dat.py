@@ -262,6 +262,7 @@ def test_fisheye_coefficients_are_opencvs() -> None:
         (["--cameras", "part.yaml"], "expected camera_model, intrinsics, distortion_model, distortion_coeffs"),
         (["--cameras", "cut"], "cut: expected a whole COLMAP model, found a damaged one"),
         (["--cameras", "greedy"], "greedy: expected a whole COLMAP model, found a damaged one (images.bin ends"),
+        (["--cameras", "camchain.yaml", "--out", "my scene"], "--out: expected the id of a scene"),
         (["--cameras", "others"], "others: expected a camera for each stream, found none for cam_00 (it has a, b, c)"),
     ],
 )
@@ -273,6 +274,7 @@ def test_bad_input_is_one_line(
     Path("damaged.yml").write_text("a: [")
     Path("empty.yml").write_text("%YAML:1.0\n---\na: 1\n")
     write_opencv(Path("no_pose.yml"), leave_out="R")
+    write_kalibr(Path("camchain.yaml"))
     write_kalibr(Path("omni.yaml"), camera_model="omni")
     write_kalibr(Path("fov.yaml"), "fov", [1.0])
     write_kalibr(Path("large.yaml"), resolution=[8, 8])
@@ -281,18 +283,20 @@ def test_bad_input_is_one_line(
     cut.write_bytes(cut.read_bytes()[:20])
     (write_colmap(Path("greedy")) / "images.bin").write_bytes(b"\xff" * 200)
     write_colmap(Path("others"), names=["a.png", "b.png", "c.png"])
-    given = {"--width": "40", "--height": "24", "--rate-hz": "20000", "--out": "out"} | {change[0]: change[1]}
+    given = {"--width": "40", "--height": "24", "--rate-hz": "20000", "--out": "out"}
+    given |= dict(zip(change[::2], change[1::2], strict=True))
     assert main(["import-dat", "in", *(text for item in given.items() for text in item)]) == 2
     error = capfd.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("error: ") and message in error
-    assert not Path("out").exists()
+    assert not Path(given["--out"]).exists()
 
 
 def test_streams_of_other_lengths_are_no_scene(tmp_path: Path) -> None:
     write_streams(tmp_path / "in", ["cam_00"])
     pack(np.zeros((3, HEIGHT, WIDTH), bool)).tofile(tmp_path / "in" / "cam_01.dat")
-    with pytest.raises(UserError, match="one length for one scene, found 3 ticks and 80 ticks"):
+    with pytest.raises(UserError, match="one size and length for one scene, found 40x24x3 and 40x24x80"):
         import_dat(tmp_path / "in", **STATED, cameras=write_colmap(tmp_path / "m"), out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
     assert import_dat(tmp_path / "in", **STATED, out=tmp_path / "out"), "without poses each has its length"
     with pytest.raises(UserError, match="a folder with .dat files"):
         import_dat(tmp_path, **STATED, out=tmp_path / "other")
@@ -350,6 +354,22 @@ def test_matrices_that_contradict_themselves(tmp_path: Path, facts: str) -> None
     write_streams(tmp_path / "in", ["left"])
     with pytest.raises(UserError, match="expected a matrix camera_matrix of left"):
         import_dat(tmp_path / "in", **STATED, cameras=tmp_path / "left.yml", out=tmp_path / "out")
+
+
+@pytest.mark.parametrize("other", ["b.png", "", ".", "/", ".."])
+def test_colmap_images_without_a_stream_refuse_nothing(tmp_path: Path, other: str) -> None:
+    """Neither their names nor their cameras, here one whose focal length is 0."""
+    model = write_colmap(tmp_path / "binary", names=["cam_00.png", "OTHER_NAME", "c.png"])
+    for name, old, new in (
+        ("images.bin", b"OTHER_NAME", other.encode()),
+        ("cameras.bin", np.float64([CAMERAS[1].fx] * 2).tobytes(), bytes(16)),
+    ):
+        head, found, tail = (model / name).read_bytes().rpartition(old)
+        (model / name).write_bytes(head + new + tail)
+        assert found
+    write_streams(tmp_path / "in", ["cam_00"])
+    import_dat(tmp_path / "in", **STATED, cameras=model, out=tmp_path / "out")
+    np.testing.assert_allclose(open_scene(tmp_path / "out").cameras["cam_00"].w2c, CAMERAS[0].w2c, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["binary", "text"])

@@ -156,9 +156,18 @@ def test_poses_must_fit_the_streams(tmp_path: Path) -> None:
     for lens in ({"camera_model": "OPENCV_FISHEYE", "k1": 0.05}, {"k4": 0.001}):
         with pytest.raises(UserError, match="expected a camera_model of OPENCV, PINHOLE"):
             attempt({"camera": "cam_00", **pose, **lens}, {"camera": "cam_01", **pose})
+    moved = to_nerfstudio(array_cameras(2, 11, 5)[1])
+    for other in (moved, {**pose, "fl_x": 2 * camera.fx}, {**pose, "k1": 0.01}, {**pose, "w": 12}):
+        with pytest.raises(UserError, match="one camera and pose for all images of cam_00, found another in frame 2"):
+            attempt({"camera": "cam_01", **pose}, {"camera": "cam_00", **pose}, {"camera": "cam_00", **other})
+    again, others = {"camera": "cam_00", **pose, "time": 0.5}, ({"camera": "x"}, pose, moved)
     with pytest.raises(UserError, match="one size and length for one scene, found 11x5x8 and 11x5x9"):
-        attempt({"camera": "cam_00", **pose}, {"camera": "cam_01", **pose})
+        attempt({"camera": "cam_00", **pose}, {"camera": "cam_01", **pose}, again, *others)
     assert not (tmp_path / "out").exists()
+    (tmp_path / "my scene").mkdir()
+    with pytest.raises(UserError, match="--out: expected the id of a scene"):
+        import_spikecv(tmp_path / "in", tmp_path / "my scene", Recording(1.0), tmp_path / "poses.json")
+    assert not list((tmp_path / "my scene").iterdir())
 
 
 def test_other_refusals(tmp_path: Path, small_scene: Path) -> None:
