@@ -196,7 +196,7 @@ def test_files_belong_to_the_camera_whose_whole_name_they_bear() -> None:
     paths = ("images/cam.0/000020.exr", "scene.json", "sparse/0/cameras.bin")
     assert [camera_of(path, cameras) for path in paths] == ["cam.0", None, None]
     named = ("0", "images", "flat")  # as folders are that belong to no camera
-    paths = ("sparse/0/images.bin", "images/0/000020.exr", "images/images/20.exr", "calibration/flat/0.dat", "flat.json")
+    paths = ("sparse/0/images.bin", "images/0/20.exr", "images/images/20.exr", "calibration/flat/0.dat", "flat.json")
     assert [camera_of(path, named) for path in paths] == [None, "0", "images", "0", None]
     assert member_name("s", "images/images/20.exr", "images") == "s/images.images.20.exr"
 
