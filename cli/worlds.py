@@ -10,8 +10,8 @@ from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import read_json, write_text
-from spike4dgs.cli.options import check_names
-from spike4dgs.generators.profiles import PROFILES, RATE_HZ, Job
+from spike4dgs.generators.make_dataset import SceneSettings
+from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.render_tasks import cameras_of, held_out_view, plan_of, world_of
 from spike4dgs.generators.rendering.image_motion import max_image_speed
 from spike4dgs.generators.rendering.render import MultiViewRenderer
@@ -52,12 +52,10 @@ def worlds(
         reports: Folder of scenes made with this profile, for the last column (WORLD-VARIANT-PROFILE.report.json).
         out: Markdown file.
     """
-    check_names("world", names, WORLDS)
-    check_names("--profile", [profile], PROFILES)
+    jobs = [SceneSettings(profile, seed, variant).job(name) for name in names or WORLDS]
     if reports is not None and not reports.is_dir():
         raise problem("--reports", "a folder with reports of scenes", str(reports), "correct the path")
-    p = PROFILES[profile]
-    rows = [_row(Job(n, variant, seed, profile, p, p.seconds), reports) for n in names or WORLDS]
+    rows = [_row(job, reports) for job in jobs]
     note = f"Ticks are {1e6 / RATE_HZ:g} us. Key spacings: of whole keys, then of those for faster parts.\n"
     write_text(out, "\n".join([*markdown(COLUMNS, rows), "", note]))
     show_table("", COLUMNS, rows, None)

@@ -68,5 +68,7 @@ def test_unknown_names_are_refused(tmp_path):
         worlds(("car", "moon"), out=tmp_path / "w.md")
     with pytest.raises(UserError, match="--profile"):
         worlds(("car",), profile="huge", out=tmp_path / "w.md")
+    with pytest.raises(UserError, match="--seed and --variant: expected numbers from 0 up, found 0, -1"):
+        worlds(("car",), variant=-1, out=tmp_path / "w.md")
     with pytest.raises(UserError, match="--reports"):
         worlds(("car",), reports=tmp_path / "nowhere", out=tmp_path / "w.md")
