@@ -6,23 +6,19 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.streams import DAT_FILE, DatFile, open_streams
 from spike4dgs.benchmark.scene.scene import Scene
-from spike4dgs.benchmark.spikes.counted_recording import total_counts
-from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.spikes.trains import trains_bytes
+from spike4dgs.benchmark.spikes.trains import spike_trains, trains_bytes
 from spike4dgs.benchmark.untrusted import MAX_GAIN
-from spike4dgs.cli.options import check_names, warn_of_size
+from spike4dgs.cli.options import WHITE, check_names, mean_rate, warn_of_size, white_of
 from spike4dgs.generators.recorder.resources import free_bytes
 from spike4dgs.method.images.clip_images import ClipImages, clip_video, write_clip_images
 
-_WHITE = 99  # percentile of the pixels' rates that is shown white, where nothing says what white is
 _MOST_FPS = 1000.0
 _GATHERING = ("adaptive", "intervals", "msdi")  # makers that hold the spike trains of a clip
 
@@ -52,8 +48,8 @@ def images(
         method: The image maker: tfp, tfi, tfstp, spk2img, adaptive, intervals or msdi.
         every: Ticks from one image to the next.
         camera: Cameras; all of a folder of streams, or the training cameras of a scene, if none is named.
-        radiance_gain: Spikes per tick of white. If left out it is the scene's, or for streams alone the rate that 1 %
-            of the pixels exceed.
+        radiance_gain: Spikes per tick of white. If left out it is the scene's, or for streams alone what 1 % of the
+            pixels exceed.
         fps: Frames per second of the video.
         device: Of a method with a network: auto, cpu or cuda.
         allow_gaps: Accept a recording with gaps. Images at missing ticks are left out.
@@ -71,12 +67,13 @@ def images(
         warn_of_size(streams)
     if method in _GATHERING:
         _check_memory(method, streams)
-    gain = radiance_gain or white or _white(list(streams.values()))
-    source = "given" if radiance_gain else "the scene's" if white else f"what {100 - _WHITE} % of the pixels exceed"
+    gain = radiance_gain or white or white_of(list(map(mean_rate, streams.values())), list(streams.values()))
+    source = "given" if radiance_gain else "the scene's" if white else f"what {100 - WHITE} % of the pixels exceed"
     print(f"{method} images of {', '.join(streams)}; white is {gain:.4g} spikes per tick, {source}")
     maker = IMAGES[method].on(device)
     for name, stream in streams.items():
         wanted = ClipImages(name, stream, maker, every, gain, fps)
+        spike_trains.cache_clear()  # of the camera before: memory was checked for those of one
         made = write_clip_images(out, wanted)
         count, seconds = len(wanted.ticks), len(wanted.ticks) / fps
         print(f"{out / name}: {count} PNG and {count} EXR images" + ("" if made else ", finished before and kept"))
@@ -106,9 +103,3 @@ def _check_memory(method: str, streams: Mapping[str, SpikeStream]) -> None:
             raise problem(
                 f"--method {method}", expected, f"{free / 1e9:.1f} GB", "take another method, or a shorter clip"
             )
-
-
-def _white(streams: Sequence[SpikeStream]) -> float:
-    """Return the rate, in spikes per tick, that 1 % of the pixels of all streams exceed; 1 where nothing fired."""
-    rates = [total_counts(s) / max(int(present(s.gaps, s.n_ticks).sum()), 1) for s in streams]
-    return float(np.percentile(np.concatenate([rate.ravel() for rate in rates]), _WHITE)) or 1.0

@@ -20,10 +20,9 @@ from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad
-from spike4dgs.benchmark.spikes.counted_recording import total_counts
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.cli.options import warn_of_size
+from spike4dgs.cli.options import mean_rate, warn_of_size, white_of
 from spike4dgs.studies.kit.timing import write_csv
 
 _INTERVAL_TICKS = 2000  # ticks at the clip's start that inter-spike intervals are taken from
@@ -67,8 +66,7 @@ def examine(name: str, stream: SpikeStream, recordings: Recordings | None = None
 
     Ticks within gaps count nowhere.
     """
-    seen = max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
-    rate = total_counts(stream) / seen
+    rate = mean_rate(stream)
     bad = find_bad(stream, recordings.flat, recordings.dark) if recordings else find_bad(stream)
     missing = sum(gap.ticks for gap in stream.gaps)
     return StreamReport(name, rate, bad, _two_intervals(stream), stream.rate_hz, stream.n_ticks, missing)
@@ -104,7 +102,7 @@ def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
     stretch without one.
     """
     middle = _middle(stream)
-    gain = float(np.percentile(report.rate, 99)) or 1.0  # shown as white; the scale of a raw recording is unknown
+    gain = white_of([report.rate], [stream])  # the scale of a raw recording is unknown
     aspect = min(max(stream.height / stream.width, 1 / _WIDEST), _WIDEST)  # of the panel; the image keeps its shape
     heights = [6 * aspect + 0.6] * 2 + [2.4] * bool(stream.gaps)  # inches
     mosaic: list[Any] = [["tfp", "tfi"], ["bad", "rates"], ["time", "time"]][: len(heights)]

@@ -1,20 +1,27 @@
-"""Options that several commands have."""
+"""Options that several commands have, and what they show white."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
 from tyro.conf import arg
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.spikes.counted_recording import total_counts
+from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.image_size import size_doubt
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
 From = Annotated[str | None, arg(name="from")]  # where a release or a weight file is fetched from
 SetValues = Annotated[tuple[str, ...], arg(name="set", metavar="PART.NAME=VALUE ...")]  # settings of methods
+
+WHITE = 99  # percentile of the pixels that is shown white
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,20 @@ def warn_of_size(streams: Mapping[str, SpikeStream]) -> None:
     """Print a line for each stream whose given size looks wrong."""
     for doubt in filter(None, map(size_doubt, streams.values())):
         print(f"warning: {doubt}", file=sys.stderr)
+
+
+def mean_rate(stream: SpikeStream) -> Float64:
+    """Return the spikes per tick [H, W] of a stream, over the ticks that it does not lack."""
+    return total_counts(stream) / max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
+
+
+def white_of(rates: Sequence[Float64], streams: Sequence[SpikeStream]) -> float:
+    """Return what to show white where nothing says it: the charge per tick that 1 % of all streams' pixels exceed.
+
+    `rates` [H, W] are those of `mean_rate`; makers divide the charge behind them by white. 1 where nothing fired.
+    """
+    charges = [gathered(rate, s.dead_ticks).ravel() for rate, s in zip(rates, streams, strict=True)]
+    return float(np.percentile(np.concatenate(charges), WHITE)) or 1.0
 
 
 def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None:

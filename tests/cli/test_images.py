@@ -16,8 +16,11 @@ from spike4dgs.benchmark.exchange.dat import import_dat
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_png
+from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import open_stream, pack
+from spike4dgs.benchmark.spikes.trains import spike_trains
 from spike4dgs.cli import main
+from spike4dgs.cli.options import mean_rate, white_of
 from spike4dgs.method.images import clip_images
 
 SIZE = ["--width", str(WIDTH), "--height", str(HEIGHT), "--rate-hz", "20000"]
@@ -48,6 +51,30 @@ def test_every_maker_makes_the_images_of_a_dat_file(dat: Path, tmp_path: Path, m
     expected = IMAGES[method](stream, [40], white)[0]
     np.testing.assert_allclose(read_exr(out / "clip/000040.exr"), expected, rtol=1e-3, atol=1e-6)
     np.testing.assert_array_equal(read_png(out / "clip/000040.png"), encode_srgb(expected))
+
+
+def test_white_is_what_makers_divide_by_also_where_ticks_are_dead(dat: Path) -> None:
+    """A pixel that fires at r has gathered r / (1 - N r): without it half an image would be white."""
+    dead = replace(open_stream(dat, WIDTH, HEIGHT, 2e4), dead_ticks=0.5)
+    white = white_of([mean_rate(dead)], [dead])
+    assert white == pytest.approx(np.percentile(gathered(dead.window(0, TICKS).mean(axis=0), 0.5), 99), rel=1e-12)
+    image = np.mean([IMAGES["tfi"](dead, [tick], white)[0] for tick in (20, 40, 60)], axis=0)
+    assert (image >= 1).mean() < 0.1
+
+
+def test_one_cameras_spike_trains_are_held_at_a_time(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, held = clip_images.write_clip_images, list[int]()
+
+    def count(out: Path, wanted: clip_images.ClipImages) -> bool:
+        held.append(spike_trains.cache_info().currsize)
+        return write(out, wanted)
+
+    monkeypatch.setattr("spike4dgs.cli.images.write_clip_images", count)
+    method = ["--method", "adaptive", "--every", "40"]
+    assert main(["images", str(small_scene), *method, "--out", str(tmp_path / "out")]) == 0
+    assert held == [0, 0, 0] and spike_trains.cache_info().currsize == 1
 
 
 def test_the_video_has_a_frame_for_each_image(dat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

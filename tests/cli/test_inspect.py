@@ -1,6 +1,7 @@
 """`inspect` on streams whose bad pixels and intervals are known, and on the optional real recording."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.exchange.streams import DatFile
 from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.calibration import Recordings
+from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings, isolated
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 from spike4dgs.cli import main
-from spike4dgs.cli.inspect import examine, inspect
+from spike4dgs.cli.inspect import examine, inspect, write_image
 
 
 def steady(ticks: int = 400, height: int = 24, width: int = 40) -> np.ndarray:
@@ -100,6 +102,21 @@ def test_a_raw_stream_becomes_an_upright_image(tmp_path: Path, capsys: pytest.Ca
     tfp = image[height // 10 : height // 2, width // 10 : width * 4 // 10]  # inside the first panel
     assert tfp[: len(tfp) // 3].mean() > tfp[-len(tfp) // 3 :].mean() + 40
     assert "top" in capsys.readouterr().out
+
+
+def test_images_of_a_sensor_with_dead_ticks_are_not_clipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    charge = np.linspace(0.05, 0.9, 24 * 40).reshape(24, 40)
+    phase = np.arange(401)[:, None, None] * (charge / (1 + charge))
+    stream = replace(stream_of(np.diff(np.floor(phase), axis=0) > 0), dead_ticks=1.0)
+    shares = list[float]()
+
+    def encode(image: np.ndarray) -> np.ndarray:
+        shares.append(float((image >= 1).mean()))
+        return encode_srgb(image)
+
+    monkeypatch.setattr("spike4dgs.cli.inspect.encode_srgb", encode)
+    write_image(tmp_path / "x.png", examine("x", stream), stream)
+    assert len(shares) == 2 and max(shares) < 0.3, "more than half without it; whole intervals round"
 
 
 def test_the_table_is_whole_in_a_pipe_and_in_a_file(
