@@ -125,5 +125,5 @@ def _check_scores(name: str, season: Season, seasons: Path, scenes: Path | None,
     opened = [open_scene(scenes / scene.id) for scene in season.scenes]
     record, given = read_result(path).record, predictions / name
     unverified = verify_record(record, path, given, opened, fitted=season.training_revisions).unverified
-    but = f", but for lack of weights {', '.join(sorted(unverified))}" if unverified else ""
+    but = f"; as claimed, not computed again: {', '.join(sorted(unverified))}" if unverified else ""
     return f"ok: the scores of {name} follow from its predictions{but}"

@@ -17,6 +17,7 @@ from spike4dgs.cli.season import check, reveal
 from spike4dgs.generators.make_dataset import SceneSettings, make_dataset
 from spike4dgs.leaderboard.season.results import write_table
 from spike4dgs.leaderboard.season.season_file import OPENING_NAME, draw_opening, read_opening
+from spike4dgs.leaderboard.verify import Rescored
 
 SCENE = "car-9003-tiny"
 
@@ -45,6 +46,15 @@ def test_all_is_right(over: Made, capsys: pytest.CaptureFixture[str]) -> None:
     shown = capsys.readouterr()
     assert not shown.err and "not checked" not in shown.out
     assert len(shown.out.splitlines()) == shown.out.count("ok: ") == 2 + 2 * 3 + 2
+
+
+def test_metrics_that_were_not_computed_again_are_named(over: Made, monkeypatch: pytest.MonkeyPatch, said: Any) -> None:
+    """For lack of weights, or because other weights are here."""
+    found = Rescored(frozenset({"metaiqa", "lpips"}), {})
+    monkeypatch.setattr("spike4dgs.leaderboard.season.check.verify_record", lambda *_, **__: found)
+    said()
+    assert checked(over) == 0
+    assert "follow from its predictions; as claimed, not computed again: lpips, metaiqa\n" in said()
 
 
 def test_public_files_alone_say_what_remains(over: Made, said: Any) -> None:
