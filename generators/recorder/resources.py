@@ -1,7 +1,5 @@
 """What a capture takes of the machine: memory for data that wait for the disk, and real-time priority.
 
-Real-time priority during a capture, so that no other program delays a reading thread for longer than its reads last.
-
 Beside programs that keep all cores busy an ordinary thread may wait for longer than the reads last, and a camera then
 loses data unseen. A better nice value does not suffice.
 """
