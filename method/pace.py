@@ -18,7 +18,7 @@ from spike4dgs.method.images.training import ImageSettings
 from spike4dgs.method.training_views.changes import POINTS, changing
 from spike4dgs.method.training_views.light_layers import in_mean_light
 from spike4dgs.method.training_views.training_images import TrainingImages
-from spike4dgs.method.training_views.velocities import LEAST_SIDE_PX, mean_flow
+from spike4dgs.method.training_views.velocities import LEAST_SIDE_PX, mean_flow, seen_by_enough
 
 SHARE = 0.95  # of the pixels that change, which move more slowly than what counts as fast
 TIMES = (0.25, 0.5, 0.75)  # of the clip, at which motion is measured
@@ -50,7 +50,10 @@ def fast_motion(images: TrainingImages) -> float:
     count = len(images.ticks)
     if count < 3 or min(images.views.width, images.views.height) < LEAST_SIDE_PX:
         return 0.0
-    middles = sorted({min(max(round(t * (count - 1)), 1), count - 2) for t in TIMES})
+    whole = np.array([m for m in range(1, count - 1) if seen_by_enough(images, (m - 1, m, m + 1))])
+    if not len(whole):
+        return 0.0
+    middles = sorted({int(whole[np.abs(whole - round(t * (count - 1))).argmin()]) for t in TIMES})
     trios = torch.tensor([[m - 1, m, m + 1] for m in middles])
     values = in_mean_light(images).images[trios].cpu()
     changed = changing(values.flatten(0, 1), POINTS).numpy()

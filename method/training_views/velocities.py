@@ -7,7 +7,7 @@ Geman and McClure (1985) for the distance between f and J v.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -51,11 +51,25 @@ def velocities_at(points: Tensor, images: TrainingImages, ticks: float) -> Tenso
 
 
 def _three_images(images: TrainingImages, ticks: float) -> tuple[int, int, int] | None:
-    """Return the indices of the images in the middle of the clip, and `ticks` before and after."""
+    """Return the indices of the images in the middle of the clip, and `ticks` before and after.
+
+    Where a gap holds one of them, they are those around the nearest other time.
+    """
     at = np.array(images.ticks)
-    middle = int(np.abs(at - images.n_ticks / 2).argmin())
-    before, after = (int(np.abs(at - at[middle] - sign * ticks).argmin()) for sign in (-1, 1))
-    return (before, middle, after) if before < middle < after else None
+    nearest = np.abs(at - images.n_ticks / 2).argsort(kind="stable")
+    for middle in map(int, nearest if images.missing is not None else nearest[:1]):
+        before, after = (int(np.abs(at - at[middle] - sign * ticks).argmin()) for sign in (-1, 1))
+        if before < middle < after and seen_by_enough(images, (before, middle, after)):
+            return before, middle, after
+    return None
+
+
+def seen_by_enough(images: TrainingImages, times: Sequence[int]) -> bool:
+    """Return whether `LEAST_VIEWS` views, or all where there are fewer, lack none of the images at some times."""
+    if images.missing is None:
+        return True
+    whole = ~images.missing[list(times)].any(0)
+    return int(whole.sum()) >= min(LEAST_VIEWS, len(whole))
 
 
 def mean_flow(before: Float32, middle: Float32, after: Float32) -> Float32:

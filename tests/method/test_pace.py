@@ -58,6 +58,14 @@ def test_too_few_or_tiny_images_tell_nothing() -> None:
     assert 10 * fast_motion(TrainingImages(tiny, (1, 2, 3), torch.rand(3, 3, 40, 11), 10)) == 0
 
 
+def test_motion_is_measured_beside_a_gap_of_all_cameras() -> None:
+    images = clip(2.5, count=7)
+    missing = torch.zeros(7, len(VIEWS), dtype=torch.bool)
+    missing[3] = True  # of each of the three trios
+    assert 10 * fast_motion(replace(images, missing=missing)) == pytest.approx(2.5, rel=0.1)
+    assert fast_motion(replace(images, missing=torch.ones_like(missing))) == 0
+
+
 def settings(in_pace: bool = True) -> dict[str, object]:
     return {"images": ImageSettings(time_spacing_ticks=10), "motion": PathSettings(in_pace=in_pace)}
 

@@ -106,6 +106,17 @@ def test_missing_images_are_left_out() -> None:
     assert (found - VELOCITY).norm(dim=1).max() < 0.1 * VELOCITY.norm()
 
 
+@pytest.mark.usefixtures("no_prior")
+def test_a_gap_of_all_cameras_in_the_middle_moves_the_images_that_tell() -> None:
+    images = images_of(views(5))
+    missing = torch.zeros(len(TICKS), 5, dtype=torch.bool)
+    missing[TICKS.index(200), 2:] = True  # two are too few
+    dark = images.images.where(~missing[..., None, None], 0.0)
+    found = velocities_at(POINTS, replace(images, images=dark, missing=missing), 50)
+    assert (found - VELOCITY).norm(dim=1).max() < 0.2 * VELOCITY.norm()
+    assert not velocities_at(POINTS, replace(images, missing=torch.ones_like(missing)), 50).any()
+
+
 @pytest.mark.parametrize("lens", [None, BARREL, CUSHION])
 def test_jacobians_are_those_of_the_projection(lens: tuple[float, ...] | None) -> None:
     v = through(views(3), lens) if lens else views(3)
