@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from spike4dgs.benchmark.errors import problem
@@ -31,9 +32,10 @@ class Checkpoint:
         """Return the checkpoint of several parts, each tensors by name."""
         return cls(step, {f"{part}.{name}": v for part, tensors in parts.items() for name, v in tensors.items()})
 
-    def part(self, prefix: str) -> dict[str, Tensor]:
-        """Return the tensors whose name starts with `prefix.`, without it."""
-        return part(self.tensors, prefix)
+    def part(self, prefix: str, device: torch.device | None = None) -> dict[str, Tensor]:
+        """Return the tensors whose name starts with `prefix.`, without it; on a device, if one is given."""
+        found = part(self.tensors, prefix)
+        return found if device is None else {name: v.to(device) for name, v in found.items()}
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, fit: str) -> None:

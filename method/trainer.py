@@ -277,24 +277,23 @@ class Trainer:
     def restore(self, saved: Checkpoint) -> None:
         """Go on from a checkpoint of the same fit."""
         device = self.gaussians.means.device
-        parts = ("gaussians", "background", "statistics")
-        on = {part: {k: v.to(device) for k, v in saved.part(part).items()} for part in parts}
         self.step = saved.step
-        self.gaussians = Gaussians.from_tensors(on["gaussians"]).trainable()
-        if len(on["background"]["means"]):
-            self._set_background(Gaussians.from_tensors(on["background"]))
+        self.gaussians = Gaussians.from_tensors(saved.part("gaussians", device)).trainable()
+        background = Gaussians.from_tensors(saved.part("background", device))
+        if len(background):
+            self._set_background(background)
         for stage in self.plan:
-            if ended := saved.part(f"piece{stage.piece}"):
-                self.ended[stage.piece] = Gaussians.from_tensors({k: v.to(device) for k, v in ended.items()})
+            if ended := saved.part(f"piece{stage.piece}", device):
+                self.ended[stage.piece] = Gaussians.from_tensors(ended)
         self.motion.load_state_dict(saved.part("motion"))
         self.supervision.load_state_dict(saved.part("supervision"))
         self.poses.load_state_dict(saved.part("poses"))
         # At a stage's first step the optimiser in the file is the last stage's, and train_step replaces it.
         stage = next(s for s in reversed(self.plan) if s.first < max(self.step, 1))
         self._begin(stage)
-        if snapshot := saved.part("snapshot"):
-            self._correct_by(Gaussians.from_tensors({k: v.to(device) for k, v in snapshot.items()}))
-        self.coherence.restore({k: v.to(device) for k, v in saved.part("coherence").items()})
+        if snapshot := saved.part("snapshot", device):
+            self._correct_by(Gaussians.from_tensors(snapshot))
+        self.coherence.restore(saved.part("coherence", device))
         import_state(self.adam, saved.part("adam"))
-        self.averages.means = {k: v.to(device) for k, v in saved.part("average").items()}
-        self.statistics = GradientStatistics(on["statistics"]["gradient"], on["statistics"]["seen"])
+        self.averages.means = saved.part("average", device)
+        self.statistics = GradientStatistics(**saved.part("statistics", device))
