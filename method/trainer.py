@@ -1,7 +1,8 @@
 """The one trainer of all recipes: the stages of `schedule`, static and deforming; several views of one time per step.
 
 Everything random comes from generators seeded by (seed, step), so that the step number is the whole random state
-and a fit that resumes from a checkpoint gives the bits of one that never stopped (on the CPU).
+and a fit that resumes from a checkpoint gives the bits of one that never stopped (on the CPU). The charges that losses
+on spikes begin with are seeded by the step alone: other seeds do not vary them.
 """
 
 from __future__ import annotations

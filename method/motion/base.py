@@ -57,7 +57,7 @@ class Motion(nn.Module):
 
     @property
     def guided_rounds(self) -> int:
-        """Number of times in a fit that the trainer asks for `guide`."""
+        """Number of times in a fit that the trainer asks for `guided_samples`."""
         return 0
 
     def splats(self, gaussians: Gaussians, t: float) -> Splats:

@@ -78,7 +78,8 @@ def random_charge(like: Tensor, step: int) -> Tensor:
     """Return charges in [0, 1) of neurons before their first tick, of the shape of `like`, a function of the step.
 
     A camera's charge at a window's start is anything from 0 to 1. Random anew for each step, it makes the expected loss
-    least at the right rate; a fixed one would leave rates free within a spike per window.
+    least at the right rate; a fixed one would leave rates free within a spike per window. Fits of all seeds share
+    them.
     """
     return torch.rand(like.shape, generator=torch.Generator().manual_seed(step)).to(like)
 
