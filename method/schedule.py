@@ -58,9 +58,15 @@ class TrainerSettings(Settings):
     beta2: float = 0.99  # 1000 steps in all: 0.999 would average over the whole fit
 
     def __post_init__(self) -> None:
-        if not 0 < self.initial_opacity < 1:
-            fix = "correct the number"
-            raise problem("settings of trainer", "initial_opacity between 0 and 1", str(self.initial_opacity), fix)
+        wanted = {
+            "initial_opacity between 0 and 1": (self.initial_opacity, 0 < self.initial_opacity < 1),
+            "initial_scale above 0": (self.initial_scale, self.initial_scale > 0),
+            "views_per_step of 1 or more": (self.views_per_step, self.views_per_step >= 1),
+            "ramp from 0 to 1": (self.ramp, 0 <= self.ramp <= 1),
+        }
+        for expected, (value, holds) in wanted.items():
+            if not holds:
+                raise problem("settings of trainer", expected, str(value), "correct the number")
 
     @property
     def pixel_filter(self) -> PixelFilter:

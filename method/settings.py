@@ -7,6 +7,7 @@ For example:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self, TypeVar
@@ -60,6 +61,8 @@ def make_settings(overrides: Mapping[str, Any], where: str, defaults: S, prefix:
         kind = type(getattr(defaults, name))
         if isinstance(value, bool) != (kind is bool) or not isinstance(value, (int, float) if kind is float else kind):
             raise problem(where, f"{prefix}{name} as {kind.__name__}", repr(value), "correct the value")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise problem(where, f"a finite {prefix}{name}", repr(value), "correct the value")
     return replace(defaults, **overrides)
 
 

@@ -245,8 +245,10 @@ def test_one_seed_one_result_and_another_seed_another(hard_case: HardCase):
     [
         *((TrainerSettings(), *wrong) for wrong in (("steps", 3), ("coarse_steps", 2.5), ("coarse_steps", True))),
         *((TrainerSettings(), *wrong) for wrong in (("ramp", "slow"), ("refine_poses", 1))),
-        # Numbers without a logarithm.
+        # Numbers without a logarithm, or without a meaning.
         *((TrainerSettings(), "initial_opacity", wrong) for wrong in (0.0, 1.0)),
+        *((TrainerSettings(), "initial_scale", wrong) for wrong in (0.0, float("inf"), float("nan"))),
+        *((TrainerSettings(), *wrong) for wrong in (("views_per_step", 0), ("views_per_step", -1), ("ramp", -1.0))),
         (DensitySettings(), "grow_scale3d", 0.0),
     ],
 )
