@@ -37,7 +37,7 @@ class Survey:
 def survey_streams(scene: TrainingScene) -> Survey:
     """Return a scene without holes in its streams. Poses do not matter.
 
-    Raises UserError where fewer than two cameras have recorded enough.
+    Raises UserError where fewer than two cameras have recorded enough, or have enough pixels that work.
     """
     notes: list[str] = []
     scene = _enough(scene, notes)
@@ -51,19 +51,17 @@ def survey_streams(scene: TrainingScene) -> Survey:
     }
     kept = [i for i, camera in enumerate(scene.cameras) if bad[camera.id].all.mean() <= MOST_BAD]
     notes += [f"most pixels of {c.id} are bad: left out" for i, c in enumerate(scene.cameras) if i not in kept]
+    scene = _only(replace(scene, streams=filled), kept, "most of whose pixels work")
     masks = [bad[camera.id].all for camera in scene.cameras]
+    found = {c.id: replace(scene.state(c.id), bad=m) for c, m in zip(scene.cameras, masks, strict=True) if m.any()}
     scene = replace(
         scene,
-        streams=tuple(fill_pixels(s, m) for s, m in zip(filled, masks, strict=True)),
+        streams=tuple(fill_pixels(s, m) for s, m in zip(scene.streams, masks, strict=True)),
         recordings=tuple(_without(r, m) for r, m in zip(scene.recordings, masks, strict=True))
         if scene.recordings
         else (),
-        states={
-            **scene.states,
-            **{c.id: replace(scene.state(c.id), bad=bad[c.id].all) for c in scene.cameras if bad[c.id].all.any()},
-        },
+        states={**scene.states, **found},
     )
-    scene = _only(scene, kept)
     return Survey(scene, bad, (*notes, *_pixel_notes([bad[c.id] for c in scene.cameras])))
 
 
@@ -96,10 +94,7 @@ def _enough(scene: TrainingScene, notes: list[str]) -> TrainingScene:
     for camera, own in zip(scene.cameras, share, strict=True):
         if own < LEAST_PRESENT:
             notes.append(f"{camera.id} lacks {1 - own:.0%} of its ticks: left out")
-    if len(kept) < min(2, len(share)):
-        fix = "record again, or choose another split"
-        raise problem(f"scene {scene.id}", "two cameras that recorded spikes, in most ticks", f"{len(kept)}", fix)
-    return _only(scene, kept)
+    return _only(scene, kept, "that recorded spikes, in most ticks")
 
 
 def _check_exposures(scene: TrainingScene) -> None:
@@ -115,7 +110,11 @@ def _check_exposures(scene: TrainingScene) -> None:
         raise problem(f"scene {scene.id}", expected, found, "set the exposures alike, or leave the camera out")
 
 
-def _only(scene: TrainingScene, kept: Sequence[int]) -> TrainingScene:
+def _only(scene: TrainingScene, kept: Sequence[int], why: str) -> TrainingScene:
+    """Return the scene of some of its cameras. Raises UserError for fewer than two, where the scene has two."""
+    if len(kept) < min(2, len(scene.cameras)):
+        fix = "record again, or choose another split"
+        raise problem(f"scene {scene.id}", f"two cameras {why}", f"{len(kept)}", fix)
     if len(kept) == len(scene.cameras):
         return scene
     return replace(

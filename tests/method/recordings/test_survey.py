@@ -12,6 +12,7 @@ from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.images.training import ImageSettings, make_training_images
+from spike4dgs.method.recordings import survey
 from spike4dgs.method.recordings.camera_facts import log_gains, shrunk
 from spike4dgs.method.recordings.survey import survey_gains, survey_streams
 
@@ -110,6 +111,19 @@ def test_bad_pixels_are_filled_and_left_out_of_the_loss():
         assert np.isfinite(measured[0]).all()
         clean = make_training_images(SCENE, SCENE.cameras, IMAGES["tfp"], ImageSettings(), "cpu").images[:, 1][:, bad]
         assert float((images.images[:, 1][:, bad] - clean).abs().mean()) < 0.2, "a neighbour's, not black"
+
+
+def test_cameras_whose_pixels_are_mostly_bad_are_left_out_as_they_are_but_two_must_be_good(monkeypatch):
+    column = np.broadcast_to(np.arange(WORLD.width) / WORLD.width, (WORLD.height, WORLD.width))
+    dead, hot, good = column < 0.4, column > 0.6, recordings()
+    broken = Recordings(recordings(dead).flat, recordings(~hot).flat, 0.7)
+    filled, fill = [], survey.fill_pixels
+    monkeypatch.setattr(survey, "fill_pixels", lambda stream, mask: filled.append(mask.mean()) or fill(stream, mask))
+    found = survey_streams(replace(SCENE, recordings=(broken, *[good] * (len(NAMES) - 1))))
+    assert [c.id for c in found.scene.cameras] == NAMES[1:] and len(found.scene.recordings) == len(NAMES) - 1
+    assert f"most pixels of {NAMES[0]} are bad: left out" in found.notes and max(filled) < 0.5
+    with pytest.raises(UserError, match="expected two cameras most of whose pixels work, found 1"):
+        survey_streams(replace(SCENE, recordings=(good, *[broken] * (len(NAMES) - 1))))
 
 
 def test_log_gains_are_found_among_outliers_and_hidden_points():
