@@ -74,12 +74,16 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
         raise problem(root, "two or more streams of one size, rate and length", found, "record all cameras together")
     _check_size(root, streams.values())
     names = sorted(streams)
-    revision = sha256_json({c: sha256_file(Path(streams[c].source)) for c in names})
     first = streams[names[0]]
     clock = first.rate_hz, first.n_ticks
     surveyed = survey_streams(
         TrainingScene(
-            root.resolve().name, revision, _guess(names, first), tuple(streams[c] for c in names), *clock, 1.0
+            root.resolve().name,
+            streams_revision(streams),
+            _guess(names, first),
+            tuple(streams[c] for c in names),
+            *clock,
+            1.0,
         )
     )
     scene = surveyed.scene
@@ -101,6 +105,21 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     )
     facts = camera_facts(training, streams, surveyed.bad)
     return Recording(training, ALL, ESTIMATED, facts, notes=(*surveyed.notes, *notes, *gain_notes))
+
+
+def streams_revision(streams: Mapping[str, SpikeStream]) -> str:
+    """Return the revision of a folder of streams: of its files, and of what its description says of them."""
+    said = "width", "height", "rate_hz", "rows_bottom_up", "dead_ticks"
+    return sha256_json(
+        {
+            camera: {
+                "sha256": sha256_file(Path(stream.source)),
+                "gaps": [(gap.first_tick, gap.ticks) for gap in stream.gaps],
+                **{name: getattr(stream, name) for name in said},
+            }
+            for camera, stream in streams.items()
+        }
+    )
 
 
 def _check_size(root: Path, streams: Iterable[SpikeStream]) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -30,14 +31,15 @@ from spike4dgs.benchmark.runs.record import read_record
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
-from spike4dgs.benchmark.spikes.folder import write_stream_folder
+from spike4dgs.benchmark.spikes.folder import open_stream_folder, write_stream_folder
+from spike4dgs.benchmark.spikes.gaps import Gap
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, pack
 from spike4dgs.cli import main
 from spike4dgs.method import load_model
 from spike4dgs.method.recordings import fit as fit_module
 from spike4dgs.method.recordings.fit import MODEL, PREDICTIONS, REPORT, SHEET, VIDEO
 from spike4dgs.method.recordings.held_out import SHOWN
-from spike4dgs.method.recordings.recording import open_recording, own_frame
+from spike4dgs.method.recordings.recording import open_recording, own_frame, streams_revision
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)
 SHORT = ("--budget", "0.02", "--device", "cpu")
@@ -200,6 +202,18 @@ def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, no_shee
     ((_, images, *shown),) = table_rows(page, "cam_03")
     assert images == "3" and shown == [METRICS[m].format(values[m]) for m in SHOWN]
     assert table_rows(page, "mean") == [["mean", "3", *shown]], "the mean over cameras too"
+
+
+def test_the_revision_of_streams_is_that_of_their_description_too(tmp_path: Path) -> None:
+    """Else a fit after a correction of stream.json would find the model of the wrong one, and keep it."""
+    write_stream_folder(tmp_path, write_streams(tmp_path))
+    given = open_stream_folder(tmp_path)
+    gap, order = Gap("cam_00", 5, 2, "lost"), dict(reversed(given.items()))
+    corrections = {"width": 60, "height": 96, "rate_hz": 40000.0, "rows_bottom_up": False, "dead_ticks": 1.0}
+    streams = [replace(given["cam_00"], **{name: value}) for name, value in (*corrections.items(), ("gaps", (gap,)))]
+    corrected = {streams_revision({**given, "cam_00": stream}) for stream in streams}
+    assert len(corrected) == 6 and streams_revision(given) not in corrected
+    assert streams_revision(order) == streams_revision(open_stream_folder(tmp_path)) == streams_revision(given)
 
 
 def test_streams_without_poses_get_estimated_ones(tmp_path: Path, no_sheet: None, capsys) -> None:
