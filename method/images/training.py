@@ -74,7 +74,7 @@ def make_training_images(
     `light` is what changes in the scene's light, if anything: makers that know of it show mean light. Where it is a
     lamp's they show the light that there is, and the images say so. A dead pixel, which has no value, counts as bad.
     """
-    ticks, made, spans = _make(scene, make, settings, device, light)
+    ticks, made, spans = make_images(scene, make, settings, device, light)
     dead, bad, missing = fill_dead(made), bad_pixels(scene), missing_images(scene, ticks)
     images = torch.from_numpy(made).to(device)
     known_bad = [np.asarray(found) for found in (dead, bad) if found is not None]
@@ -94,19 +94,13 @@ def recorded_training_images(
 
 
 def make_images(
-    scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str
-) -> tuple[tuple[int, ...], Float32]:
-    """Return the chosen ticks and the images [T, C, H, W] at the pixels of the training streams.
-
-    Ticks are the array's. A camera's image is made at its own tick then, or at the end of its clip nearest to it.
-    """
-    return _make(scene, make, settings, device)[:2]
-
-
-def _make(
     scene: TrainingScene, make: ImageMaker, settings: ImageSettings, device: str, light: Light | None = None
 ) -> tuple[tuple[int, ...], Float32, Spans | None]:
-    """Return ticks and images as `make_images` does, and the spans of time that they are means over, if they are."""
+    """Return the chosen ticks, the images [T, C, H, W] at the streams' pixels, and the spans that they are means over.
+
+    Ticks are the array's. A camera's image is made at its own tick then, or at the end of its clip nearest to it. No
+    spans: the images show instants.
+    """
     make = make.on(device)
     ticks = choose_ticks(scene.n_ticks, settings)
     height, width = scene.streams[0].height, scene.streams[0].width

@@ -54,7 +54,7 @@ def compare(
     settings: ImageSettings = recipe.settings["images"] if recipe else ImageSettings()  # type: ignore[assignment]
     if settings.flat_field:
         scene = in_todays_dark(scene)  # as the fit has it
-    ticks, images = make_images(scene, make, replace(settings, max_times=TIMES), device)
+    ticks, images, _ = make_images(scene, make, replace(settings, max_times=TIMES), device)
     times = tuple(tick * 1e6 / scene.rate_hz for tick in ticks)
     rendered = np.stack([[model.render(camera, t) for camera in cameras] for t in times])
     return Comparison(tuple(cameras), times, as_measured(scene, ticks, images), rendered, maker)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -15,8 +16,6 @@ from spike4dgs.method.self_calibration.pose_adjustment import Adjusted, AdjustSe
 from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.starts.structure_from_motion import FEATURES, FeatureSettings
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
-
-Float32 = np.typing.NDArray[np.float32]
 
 LEAST_POINTS = 50  # that views have in common: fewer tell no poses
 # Of the given poses' error, in those of the adjusted ones, from which the given ones are wrong. On clean scenes it is
@@ -82,5 +81,5 @@ def _means(scene: TrainingScene) -> Float32:
     return window_means(scene, 0, scene.n_ticks, flat_field=bool(scene.calibrations))
 
 
-def _median(errors: np.typing.NDArray[np.float64]) -> float:
+def _median(errors: Float64) -> float:
     return float(np.median(errors)) if len(errors) else float("nan")
