@@ -39,6 +39,7 @@ from spike4dgs.baselines.tracking.losses import (
     unit_quaternions,
 )
 from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.fit import Algorithm, FitJob
 from spike4dgs.method.gaussians.density import DensitySettings
@@ -94,6 +95,10 @@ class TrackingSettings(Settings):
     beta1: float = 0.9
     beta2: float = 0.99  # (0.999, which would average over far more steps than a time has)
 
+    def __post_init__(self) -> None:
+        if self.neighbours < 1:
+            raise problem("neighbours", "at least 1", str(self.neighbours), "choose another number")
+
     def scaled(self, scale: float) -> TrackingSettings:
         """Return the same settings with the step counts multiplied by a budget's scale."""
         first, later = (max(1, round(steps * scale)) for steps in (self.first_steps, self.later_steps))
@@ -142,10 +147,8 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
         tracker.restore(saved)
     with one_torch_thread():
         tracker.run(checkpoint_s)
-    tracks, duration_us = tracker.tracks, job.scene.duration_us
-    if job.light:
-        tracks = tracks.lit(gaussians, job.light.factors, duration_us)
-    return TrackedModel(gaussians, tracks, duration_us, tuple(job.start.cameras))
+    light = torch.tensor(job.light.factors, dtype=torch.float32) if job.light else None
+    return TrackedModel(gaussians, tracker.tracks, job.scene.duration_us, tuple(job.start.cameras), light)
 
 
 def first_index(job: FitJob) -> int:
@@ -157,8 +160,8 @@ def first_index(job: FitJob) -> int:
 
 
 def step_count(settings: TrackingSettings, visit: Visit) -> int:
-    """Return the steps of one further time."""
-    return round(settings.later_steps * (settings.first_move if visit.earlier is None else 1))
+    """Return the steps of one further time, at least one."""
+    return max(1, round(settings.later_steps * (settings.first_move if visit.earlier is None else 1)))
 
 
 def fit_first(job: FitJob) -> Gaussians:
@@ -221,7 +224,7 @@ class Tracker:
 
     def track(self, visit: Visit) -> float:
         """Optimise one time; return the last loss."""
-        s, tracks, index = self.settings, self.tracks, visit.index
+        s, tracks, index, scale = self.settings, self.tracks, visit.index, self.job.extent.scale
         old = tracks.at(visit.before)
         leaves = {name: value.clone() for name, value in old.items()}
         if visit.earlier is not None:
@@ -232,7 +235,6 @@ class Tracker:
             leaf.requires_grad_(True)
         loss_of = self.loss(index, old)
         adam = Adam({name: [leaf] for name, leaf in leaves.items()}, (s.beta1, s.beta2))
-        scale = self.job.extent.scale
         rates = {
             "means": Decay(s.lr_means * scale, s.lr_means_last * scale),
             "quats": Decay(s.lr_quats, s.lr_quats),
@@ -242,9 +244,8 @@ class Tracker:
         for step in range(steps):
             set_learning_rates(adam, rates, step / steps)
             adam.zero_grad()
-            order = torch.randperm(
-                len(self.window.views), generator=seeded(self.job.request.seed, (index + 1) * 1_000_000 + step)
-            )
+            generator = seeded(self.job.request.seed, (index + 1) * 1_000_000 + step)
+            order = torch.randperm(len(self.window.views), generator=generator)
             loss = loss_of(leaves, order[: s.views_per_step].sort().values.tolist())
             loss.backward()
             adam.step()

@@ -9,11 +9,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.parameters import Gaussians
-from spike4dgs.method.models.fitted_model import GaussianModel, count_bytes
+from spike4dgs.method.models.fitted_model import GaussianModel, count_bytes, light_of_file
 from spike4dgs.method.models.model_file import ModelFile, group, write_model
 from spike4dgs.method.splat import Splats
 from spike4dgs.method.training_views.light_layers import factor_at
@@ -72,17 +71,6 @@ class Tracks:
         self.means[index], self.colors[index] = values["means"], values["colors"]
         self.quats[index] = torch.nn.functional.normalize(values["quats"], dim=-1)
 
-    def lit(self, gaussians: Gaussians, factors: Float64, duration_us: float) -> Tracks:
-        """Return tracks in changing light, of those in its mean: the colours of all Gaussians change with the light.
-
-        `factors` [n] are those of all light over equal parts of the clip.
-        """
-        light = [factor_at(factors, t_us / duration_us) for t_us in self.times_us.tolist()]
-        colors = gaussians.colors.repeat(len(light), 1, 1)
-        colors[:, self.rows] = self.colors
-        colors *= colors.new_tensor(light)[:, None, None]
-        return replace(self, rows=torch.arange(len(gaussians), device=colors.device), colors=colors)
-
     def between(self, t_us: float) -> dict[str, Tensor]:
         """Return values at any time: positions and rotations linear between and beyond the times, colours between them.
 
@@ -113,6 +101,7 @@ class TrackedModel(GaussianModel):
     tracks: Tracks
     duration_us: float
     cameras: tuple[Camera, ...] = ()  # the training cameras, as the fit had them; not saved
+    light: Tensor | None = None  # factors of all light over equal parts of the clip [n]; colours are in its mean
 
     @property
     def device(self) -> str:  # type: ignore[override]
@@ -129,12 +118,14 @@ class TrackedModel(GaussianModel):
         return count_bytes([*self.gaussians.tensors().values(), *self.tracks.tensors().values()])
 
     def at(self, t_us: float) -> Gaussians:
-        """Return the Gaussians at a time of the clip; times outside of it take its ends."""
+        """Return the Gaussians at a time of the clip, in that time's light; times outside of it take its ends."""
         values = self.tracks.between(min(max(t_us, 0.0), self.duration_us))
         g = self.gaussians
         means, quats, colors = g.means.clone(), g.quats.clone(), g.colors.clone()
         means[self.tracks.free], quats[self.tracks.free] = values["means"], values["quats"]
         colors[self.tracks.rows] = values["colors"]
+        if self.light is not None:  # at the instant itself: it may flicker faster than the tracks have times
+            colors *= factor_at(self.light.double().cpu().numpy(), t_us / self.duration_us)
         return replace(g, means=means, quats=quats, colors=colors)
 
     def splats(self, t_us: float) -> Splats:
@@ -145,7 +136,8 @@ class TrackedModel(GaussianModel):
         """Write the model to one file; see `saved_model.load_model`."""
         t = self.tracks
         tracks = {**t.tensors(), "times_us": t.times_us, "free": t.free, "rows": t.rows}
-        tensors = group(gaussians=self.gaussians.tensors(), tracks=tracks)
+        light = {} if self.light is None else {"light": {"factors": self.light}}
+        tensors = group(gaussians=self.gaussians.tensors(), tracks=tracks, **light)
         write_model(path, ModelFile(self.KIND, {}, tensors, provenance))
 
     @classmethod
@@ -154,7 +146,7 @@ class TrackedModel(GaussianModel):
         gaussians = Gaussians.from_file({k: v.to(device) for k, v in file.part("gaussians").items()})
         tracks = Tracks(**{k: v if k == "times_us" else v.to(device) for k, v in file.part("tracks").items()})
         tracks.check(gaussians)
-        return cls(gaussians, tracks, file.provenance.duration_us)
+        return cls(gaussians, tracks, file.provenance.duration_us, light=light_of_file(file))
 
 
 KINDS = {TrackedModel.KIND: TrackedModel.from_file}  # for the entry points `spike4dgs.models`

@@ -230,7 +230,7 @@ class FittedModel(GaussianModel):
             for part in (*(f"piece{i}" for i in range(count)), BACKGROUND)
         )
         duration_us, found = file.provenance.duration_us, _filter(file.config.get("filter", {}))
-        light = _light(file.part("light"))
+        light = light_of_file(file)
         path = ArrayPath.from_tensors(tensors) if (tensors := file.part("path")) else None
         own: dict[str, Any] = {"pixel_filter": found, "light": light, "path": path}
         made = cls(tuple(pieces), background, motion.to(device), duration_us, device, spec, **own)
@@ -239,9 +239,9 @@ class FittedModel(GaussianModel):
         return made
 
 
-def _light(tensors: Mapping[str, Tensor]) -> Tensor | None:
-    """Return the factors of the light that a file has, if any."""
-    if not tensors:
+def light_of_file(file: ModelFile) -> Tensor | None:
+    """Return the factors [n] of the light that a model's file has, if any. Raises KeyError or ValueError for others."""
+    if not (tensors := file.part("light")):
         return None
     factors = tensors["factors"]
     if factors.ndim != 1 or not 0 < len(factors) <= MAX_TICKS or not (factors.isfinite() & (factors >= 0)).all():

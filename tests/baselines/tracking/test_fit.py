@@ -206,6 +206,17 @@ def test_progress_counts_all_steps_to_the_end() -> None:
     assert [done for done, _ in seen] == sorted(done for done, _ in seen) and seen[-1][0] == 11
 
 
+@pytest.mark.parametrize("few", [{"first_move": 0.1}, {"later_steps": 0}])
+def test_a_time_takes_a_step_at_least(few: dict[str, float]) -> None:
+    tracker, visit = tracker_of(job(**{**TINY, **few})), fit.Visit(3, 2, None)
+    assert fit.step_count(tracker.settings, visit) == 1 and np.isfinite(tracker.track(visit))
+
+
+def test_tracking_without_neighbours_is_refused() -> None:
+    with pytest.raises(UserError, match=r"neighbours: expected at least 1, found 0"):
+        fit.TrackingSettings(neighbours=0)
+
+
 def test_a_scene_in_which_nothing_moves_is_one_image(tmp_path: Path) -> None:
     model = fit.fit_tracking(job(tmp_path / "fit.safetensors", static=True, **TINY))
     images = [model.render(WORLD.held_out, t) for t in (0.0, 6000.0, 12000.0)]
@@ -218,7 +229,8 @@ def test_a_fit_in_mean_light_renders_the_light_of_its_instant(static: bool) -> N
     j = job(**TINY, static=static)
     light = Light(1 + 0.3 * np.sin(2 * np.pi * np.arange(WORLD.n_ticks) / WORLD.n_ticks))
     mean, lit = fit.fit_tracking(j), fit.fit_tracking(replace(j, light=light))
-    for t_us in mean.tracks.times_us.tolist():
+    times_us = mean.tracks.times_us
+    for t_us in (*times_us.tolist(), *((times_us[1:] + times_us[:-1]) / 2).tolist()):
         image = mean.render(WORLD.held_out, t_us) * factor_at(light.factors, t_us / mean.duration_us)
         np.testing.assert_allclose(lit.render(WORLD.held_out, t_us), image, atol=1e-5)
 

@@ -96,8 +96,9 @@ def test_light_is_not_in_what_a_network_decodes() -> None:
     np.testing.assert_allclose(image, 0.5 * steady.render(WORLD.held_out, 0.0), rtol=1e-5)
 
 
-def test_a_model_keeps_the_light_that_it_was_fitted_in(tmp_path: Path) -> None:
-    steady, factors = model("paths"), torch.tensor([0.5, 1.0, 1.5, 1.0])
+@pytest.mark.parametrize("name", ["paths", "tracking"])
+def test_a_model_keeps_the_light_that_it_was_fitted_in(name: str, tmp_path: Path) -> None:
+    steady, factors = model(name), torch.tensor([0.5, 1.0, 1.5, 1.0])
     lit = dataclasses.replace(steady, light=factors)
     loaded = again(lit, tmp_path / "m")
     # The middles of four parts of the clip are at 1/8, 3/8, ...; linear between, constant beyond.
