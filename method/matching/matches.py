@@ -1,4 +1,4 @@
-"""Matches of all pairs of views: by the network, or by SIFT features, which learn nothing.
+"""Matches of all pairs of views, by the network.
 
 The network finds partners that no classical feature finds in the noise of low light, to about a pixel. Where the images
 around a match are alike, Lucas and Kanade's alignment (OpenCV) then measures it to a third of a pixel. Its error is
@@ -15,16 +15,16 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from spike4dgs.benchmark.arrays import Float32, Mask, UInt8
 from spike4dgs.method.matching.network import Features, Matcher, middle_of_cell, points_of_cells
 from spike4dgs.method.matching.tracks import Matches, PairMatches
 
 LEAST_PROBABILITY = 0.1  # that two cells are each other's best: below it most are wrong
+_MOST_AT_ONCE = 10_000**2  # pairs of cells, whose probabilities are held at once several times: 400 MB each time
+_BLOCK = 1 << 23  # pairs of a block of rows, where there are more
 _LEAST_ERROR, _MOST_ERROR = 0.05, 7.0  # px, expected
-_ENLARGE = 2  # of images 200 px wide, for SIFT: at their own size it finds few features
-_RATIO = 0.85  # of the distances to the best and the second best feature
-_SIFT_ERROR_PX = 0.5
 _COARSE_ERROR_PX = 1.0  # expected of a match that could not be aligned, at least
 # Sides of the windows that are aligned. A point takes the smallest in which noise leaves less than `_ALIGN_NOISE_PX`:
 # in a larger one the views' perspectives differ, and the error is the same for all points around.
@@ -45,8 +45,7 @@ def learned_matches(network: Matcher, inputs: Float32) -> Matches:
     features = Features(torch.cat([f.coarse for f in seen]), torch.cat([f.fine for f in seen]), seen[0].size)
     found: dict[tuple[int, int], PairMatches] = {}
     for i, j in combinations(range(len(inputs)), 2):
-        logs = network.log_probabilities(features.coarse[i, None], features.coarse[j, None])[0]
-        a, b = mutual(logs, LEAST_PROBABILITY)
+        a, b = _partners(network, features.coarse[i, None], features.coarse[j, None])
         found[i, j] = _refined(network, features, (i, j), a, b)
         found[j, i] = _refined(network, features, (j, i), b, a)
     return {(i, j): aligned(inputs[i, 0], inputs[j, 0], m) for (i, j), m in found.items()}
@@ -61,7 +60,7 @@ def aligned(first: Float32, second: Float32, matches: PairMatches) -> PairMatche
         return matches
     at, near = ((x - 0.5).astype(np.float32) for x in (matches.at, matches.uv))  # OpenCV: pixel centres at 0
     blurred = [cv2.GaussianBlur(image, (0, 0), _ALIGN_BLUR_PX) for image in (first, second)]
-    a, b = (_gray(np.asarray(image, np.float32)) for image in blurred)
+    a, b = (gray_of(np.asarray(image, np.float32)) for image in blurred)
     there, back = near.copy(), np.full_like(at, np.inf)
     noise = _noise(first) * np.stack([_error_of_noise(blurred[0], at, side) for side in _ALIGN_PX])  # [windows, M]
     fine = noise < _ALIGN_NOISE_PX
@@ -113,11 +112,43 @@ def _flow(first: UInt8, second: UInt8, at: Float32, near: Float32, side: int) ->
     return np.asarray(there, np.float32), found[:, 0] > 0
 
 
+def _partners(network: Matcher, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the cells [M] of views `a` and `b` [1, C, h, w] that are each other's best."""
+    cells = a[0, 0].numel()
+    if cells**2 <= _MOST_AT_ONCE:
+        return mutual(network.log_probabilities(a, b)[0], LEAST_PROBABILITY)
+    rows, columns = network.factors(a, b)
+    return mutual_by_rows(rows[0], columns[0], LEAST_PROBABILITY, max(1, _BLOCK // cells))
+
+
 def mutual(logs: Tensor, least: float) -> tuple[Tensor, Tensor]:
     """Return the cells [M] of both views that are each other's best in `logs` [n, m], with probability `least`."""
     best, forth = logs.max(dim=1)
-    back = logs.argmax(dim=0)
-    cells = torch.arange(len(logs), device=logs.device)
+    return _each_others(best, forth, logs.argmax(dim=0), least)
+
+
+def mutual_by_rows(a: Tensor, b: Tensor, least: float, rows: int) -> tuple[Tensor, Tensor]:
+    """Return what `mutual` does of `Matcher.factors` [n, C] and [C, m], with memory for `rows` of the n cells."""
+    blocks = a.split(rows)
+    column = b.new_full(b.shape[1:], -torch.inf)  # [m] logarithms of the sums that the second softmax divides by
+    for block in blocks:
+        column = torch.logaddexp(column, (block @ b).logsumexp(dim=0))
+    highest, back = torch.full_like(column, -torch.inf), torch.zeros_like(column, dtype=torch.long)
+    found = []
+    for number, block in enumerate(blocks):
+        similar = block @ b
+        logs = functional.log_softmax(similar, dim=1) + (similar - column)
+        found.append(logs.max(dim=1))
+        most, row = logs.max(dim=0)
+        back = torch.where(most > highest, row + number * rows, back)
+        highest = torch.maximum(most, highest)
+    best, forth = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return _each_others(best, forth, back, least)
+
+
+def _each_others(best: Tensor, forth: Tensor, back: Tensor, least: float) -> tuple[Tensor, Tensor]:
+    """Return the pairs [M] of rows and columns that agree: each row's best column, each column's best row."""
+    cells = torch.arange(len(best), device=best.device)
     kept = (back[forth] == cells) & (best.exp() >= least)
     return cells[kept], forth[kept]
 
@@ -132,44 +163,7 @@ def _refined(network: Matcher, features: Features, pair: tuple[int, int], a: Ten
     return PairMatches(a.cpu().numpy(), *(x.double().cpu().numpy() for x in (at, refined.uv, error)))
 
 
-def sift_matches(images: Float32) -> Matches:
-    """Return matches of SIFT features in images [V, H, W], the first channel of `window_inputs`."""
-    sift = cv2.SIFT.create(contrastThreshold=0.01, edgeThreshold=15)
-    spots, descriptors = [], []
-    for image in images:
-        points, described = sift.detectAndCompute(_shown(image), None)
-        uv = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
-        spots.append((uv + 0.5) / _ENLARGE)  # OpenCV's coordinates have pixel centres at 0
-        described = np.zeros((0, 128), np.float32) if described is None else described
-        unit = described / np.maximum(np.abs(described).sum(axis=1, keepdims=True), 1e-9)
-        descriptors.append(np.sqrt(unit))  # RootSIFT
-    found = {}
-    for i, j in combinations(range(len(images)), 2):
-        a, b = _nearest(descriptors[i], descriptors[j])
-        for r, s, mine, theirs in ((i, j, a, b), (j, i, b, a)):
-            error = np.full(len(mine), _SIFT_ERROR_PX)
-            found[r, s] = PairMatches(mine, spots[r][mine], spots[s][theirs], error)
-    return found
-
-
-def _shown(image: Float32) -> UInt8:
-    return np.asarray(cv2.resize(_gray(image), None, fx=_ENLARGE, fy=_ENLARGE, interpolation=cv2.INTER_CUBIC), np.uint8)
-
-
-def _gray(image: Float32) -> UInt8:
+def gray_of(root: Float32) -> UInt8:
+    """Return an image [H, W], the first channel of `window_inputs`, as OpenCV's features see it."""
     low, high = _ROOTS
-    return np.asarray(np.clip((image - low) / (high - low), 0, 1) * 255, np.uint8)
-
-
-def _nearest(a: Float32, b: Float32) -> tuple[np.ndarray, np.ndarray]:
-    """Return features [M] of both that are each other's nearest and clearly nearer than the second."""
-    if min(len(a), len(b)) < 2:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    similar = a @ b.T
-    order = np.argpartition(-similar, 1, axis=1)[:, :2]
-    two = np.sort(np.take_along_axis(similar, order, axis=1), axis=1)
-    distance = np.sqrt(np.maximum(2 - 2 * two, 0))
-    forth, back = similar.argmax(axis=1), similar.argmax(axis=0)
-    mine = np.arange(len(a))
-    kept = (back[forth] == mine) & (distance[:, 1] < _RATIO * distance[:, 0])
-    return mine[kept], forth[kept]
+    return np.asarray(np.clip((root - low) / (high - low), 0, 1) * 255, np.uint8)

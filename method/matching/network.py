@@ -94,9 +94,14 @@ class Matcher(nn.Module):
         nn.init.zeros_(self.refine[-1].weight)  # type: ignore[arg-type]
         nn.init.zeros_(self.refine[-1].bias)  # type: ignore[arg-type]
 
+    def factors(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what cells of `a` and `b` [P, C, h, w] are as alike as the product of: [P, h w, C] and [P, C, h w]."""
+        return self.sharpness.exp() * a.flatten(2).transpose(1, 2), b.flatten(2)
+
     def log_probabilities(self, a: Tensor, b: Tensor) -> Tensor:
         """Return the logarithms [P, h w, h w] that cells of `a` and `b` [P, C, h, w] are each other's best partners."""
-        similar = self.sharpness.exp() * a.flatten(2).transpose(1, 2) @ b.flatten(2)
+        rows, columns = self.factors(a, b)
+        similar = rows @ columns
         return functional.log_softmax(similar, dim=2) + functional.log_softmax(similar, dim=1)
 
     def refined(self, a: Tensor, b: Tensor, at: Tensor, near: Tensor, views: tuple[Tensor, Tensor]) -> Refined:

@@ -27,7 +27,7 @@ from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.training_bursts import Burst, BurstFile, open_folder
-from spike4dgs.method.matching.matches import learned_matches, sift_matches
+from spike4dgs.method.matching.matches import learned_matches
 from spike4dgs.method.matching.poses import solve
 from spike4dgs.method.matching.tracks import Matches
 from spike4dgs.method.matching.training.data import at_light, record, seen_by_network
@@ -36,6 +36,7 @@ from spike4dgs.method.matching.window_inputs import light_of
 from spike4dgs.method.starts.structure_from_motion import map_views
 from spike4dgs.studies.kit.checkout import code_now
 from spike4dgs.studies.kit.timing import markdown, show_table, write_csv
+from spike4dgs.studies.poses.sift import sift_matches
 
 LIGHTS = (1.0, 1 / 4, 1 / 16)
 TICKS = (41, 101, 401)  # 2, 5 and 20 ms

@@ -21,12 +21,12 @@ from spike4dgs.benchmark.arrays import Float32, Float64
 from spike4dgs.benchmark.files import write_text
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.matching.adjust import Array
-from spike4dgs.method.matching.cost_volume import cell_depths
 from spike4dgs.method.matching.network import FINE
 from spike4dgs.method.matching.weights import WEIGHTS, load_matcher
 from spike4dgs.method.matching.window_inputs import light_of
 from spike4dgs.method.starts.plane_sweep import full_range, inverse_depth_step, sweep
 from spike4dgs.studies.kit.timing import markdown, show_table
+from spike4dgs.studies.poses.cost_volume import cell_depths
 from spike4dgs.studies.poses.dark import EXPOSURE, LIGHTS, Sight, named, resting_arrays, see, with_progress, write_rows
 
 TICKS = (101, 401)  # 5 and 20 ms
@@ -92,8 +92,8 @@ def _network(sight: Sight) -> Depths:
     network = load_matcher(WEIGHTS.in_use().path, "cpu")
     fine = torch.cat([network.extractor(torch.from_numpy(view[None])).fine for view in sight.inputs])
     R, centers, K = (np.stack([getattr(c, name) for c in sight.cameras]) for name in ("R", "center", "K"))
-    cells = cell_depths(fine, Array(R, centers, K), 0, full_range(sight.cameras))
     rows, columns = sight.inputs.shape[2:]
+    cells = cell_depths(fine, (rows, columns), Array(R, centers, K), 0, full_range(sight.cameras))
     cell = np.ones((FINE, FINE), np.float32)
     inverse, sure = (np.kron(x, cell)[:rows, :columns] for x in (cells.inverse, cells.confidence))
     return inverse, sure

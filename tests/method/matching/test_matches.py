@@ -1,9 +1,9 @@
-"""Matches: alignment of images whose shift is known, and SIFT's matches of a turned image."""
+"""Matches: alignment of images whose shift is known, and tracks of matches."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, shift
 
-from spike4dgs.method.matching.matches import aligned, sift_matches
+from spike4dgs.method.matching.matches import aligned
 from spike4dgs.method.matching.tracks import PairMatches, make_tracks
 
 
@@ -31,17 +31,6 @@ def test_alignment_finds_a_shift_to_a_tenth_of_a_pixel() -> None:
     assert (kept.error >= 0.3).all()
     empty = PairMatches(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     assert aligned(a, b, empty) is empty
-
-
-def test_sift_matches_a_shifted_image_both_ways() -> None:
-    first = texture(3)
-    second = shift(first, (4, 6), order=1, mode="nearest")
-    matches = sift_matches(np.stack([first, second]))
-    assert set(matches) == {(0, 1), (1, 0)}
-    for pair, moved in (((0, 1), (6, 4)), ((1, 0), (-6, -4))):
-        m = matches[pair]
-        assert len(m.point) > 50
-        assert np.median(np.linalg.norm(m.uv - m.at - moved, axis=1)) < 0.2
 
 
 def test_tracks_join_the_sights_of_a_point_and_prefer_those_of_many_views() -> None:

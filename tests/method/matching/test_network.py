@@ -5,8 +5,9 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
+from spike4dgs.method.matching import matches
 from spike4dgs.method.matching.config import BOTTLENECK, TINY
-from spike4dgs.method.matching.matches import learned_matches, mutual
+from spike4dgs.method.matching.matches import learned_matches, mutual, mutual_by_rows
 from spike4dgs.method.matching.network import FINE, Matcher, points_of_cells, sample
 
 
@@ -45,6 +46,37 @@ def test_probabilities_are_the_product_of_both_softmaxes() -> None:
         assert found[x].argmax() == y and found[:, y].argmax() == x
 
 
+@pytest.mark.parametrize("rows", [1, 7, 30, 50])
+def test_partners_found_in_blocks_of_rows_are_those_of_the_whole_matrix(rows: int) -> None:
+    torch.manual_seed(2)
+    network = Matcher(TINY)
+    a = torch.nn.functional.normalize(torch.randn(1, 8, 5, 6), dim=1)
+    b = torch.nn.functional.normalize(a.flip(3) + 0.5 * torch.randn(1, 8, 5, 6), dim=1)
+    for least, count in ((0.0, 22), (0.3, 12)):  # of 30 cells
+        whole = mutual(network.log_probabilities(a, b)[0], least)
+        assert abs(len(whole[0]) - count) < 4
+        found = mutual_by_rows(*(factor[0] for factor in network.factors(a, b)), least, rows)
+        assert all(torch.equal(x, y) for x, y in zip(found, whole, strict=True))
+
+
+def test_views_of_many_cells_are_matched_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(1)
+    network = Matcher(TINY)
+    with torch.no_grad():
+        network.sharpness.fill_(6.0)
+    views = np.random.default_rng(0).normal(size=(2, 4, 24, 32)).astype(np.float32)
+    views[1] = views[0]
+    whole = learned_matches(network, views)
+    monkeypatch.setattr(matches, "_MOST_AT_ONCE", 48**2 - 1)
+    monkeypatch.setattr(matches, "_BLOCK", 7 * 48)
+    monkeypatch.setattr(Matcher, "log_probabilities", None)  # it would hold all pairs
+    blocks = learned_matches(network, views)
+    for pair, m in whole.items():
+        assert len(m.point) > 20
+        np.testing.assert_array_equal(blocks[pair].point, m.point)
+        np.testing.assert_array_equal(blocks[pair].uv, m.uv)
+
+
 def test_a_shift_of_the_features_is_a_shift_of_the_first_estimate() -> None:
     torch.manual_seed(0)
     network = Matcher(TINY)
@@ -66,9 +98,9 @@ def test_matches_of_a_view_with_itself_are_where_they_are() -> None:
     with torch.no_grad():
         network.sharpness.fill_(6.0)
     view = np.random.default_rng(0).normal(size=(4, 48, 64)).astype(np.float32)
-    matches = learned_matches(network, np.stack([view, view]))
-    assert set(matches) == {(0, 1), (1, 0)}
-    m = matches[0, 1]
+    found = learned_matches(network, np.stack([view, view]))
+    assert set(found) == {(0, 1), (1, 0)}
+    m = found[0, 1]
     assert len(m.point) > 100
     assert np.abs(m.uv - m.at).max() < 12 and (m.error > 0).all()  # a cell, its neighbour, and the alignment's reach
     np.testing.assert_array_equal(m.at[0] % 4, [2.5, 2.5])

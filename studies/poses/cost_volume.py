@@ -28,8 +28,11 @@ class CellDepths:
 
 
 @torch.inference_mode()
-def cell_depths(fine: Tensor, array: Array, view: int, planes: Float64) -> CellDepths:
-    """Return the depths of a view's cells; `fine` [V, F, h, w] features, cells of FINE px, `planes` [D] rising."""
+def cell_depths(fine: Tensor, size: tuple[int, int], array: Array, view: int, planes: Float64) -> CellDepths:
+    """Return the depths of a view's cells, by `planes` [D], rising.
+
+    `fine` [V, F, h, w] are features, in cells of FINE px, of images of `size` (H, W) px: cells beyond are padding.
+    """
     others = [j for j in range(len(fine)) if j != view]
     _, channels, rows, columns = fine.shape
     v, u = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
@@ -45,7 +48,7 @@ def cell_depths(fine: Tensor, array: Array, view: int, planes: Float64) -> CellD
             p = (rays @ turn.T + w * shift) @ torch.from_numpy(array.K[j]).T
             uv = p[:, :2] / p[:, 2:].clamp(min=1e-9)
             grid = (2 * uv / uv.new_tensor([columns * FINE, rows * FINE]) - 1).float()
-            inside = (p[:, 2] > 1e-9) & (grid.abs() < 1).all(dim=1)
+            inside = (p[:, 2] > 1e-9) & (uv > 0).all(dim=1) & (uv < uv.new_tensor(size[::-1])).all(dim=1)
             there = functional.grid_sample(fine[j, None], grid[None, None], align_corners=False)[0, :, 0]
             # Of unit length: a mean of two cells is shorter than either, and would count for less.
             total += (own * functional.normalize(there, dim=0)).sum(dim=0) * inside

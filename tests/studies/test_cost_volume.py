@@ -5,9 +5,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from spike4dgs.method.matching.adjust import Array
-from spike4dgs.method.matching.cost_volume import cell_depths
+from spike4dgs.studies.poses.cost_volume import cell_depths
 
 ROWS, COLUMNS, CHANNELS = 30, 40, 24
+SIZE = (60, 80)  # px of the images: no cell is padding
 NORMAL, OFFSET = np.array([0.25, -0.1, 1.0]), 4.0  # the plane n x = 4
 
 
@@ -41,13 +42,13 @@ def test_a_planes_depth_is_found_and_what_is_sure_is_right() -> None:
     array = Array(turns, centers, np.tile(K, (4, 1, 1)))
     true = true_inverse(array, 0)
     planes = np.linspace(0.85 * true.min(), 1.15 * true.max(), 48)
-    found = cell_depths(features(array), array, 0, planes)
+    found = cell_depths(features(array), SIZE, array, 0, planes)
     inside = (slice(6, -6), slice(6, -6))
     off = np.abs(found.inverse / true - 1)
     assert np.median(off[inside]) < 0.01 and np.mean(off[inside] < 0.03) > 0.9
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
     # Features that tell nothing are less sure, cell by cell, than those of the plane.
-    noise = cell_depths(torch.randn(4, CHANNELS, ROWS, COLUMNS), array, 0, planes)
+    noise = cell_depths(torch.randn(4, CHANNELS, ROWS, COLUMNS), SIZE, array, 0, planes)
     assert np.median(noise.confidence) < 0.6 * np.median(found.confidence[inside])
 
 
@@ -55,5 +56,17 @@ def test_what_one_view_alone_sees_has_no_confidence() -> None:
     K = np.array([[70.0, 0, 40], [0, 70.0, 30], [0, 0, 1]])
     away = Rotation.from_rotvec([(0, 0, 0), (0, 3.0, 0), (0, 3.0, 0)]).as_matrix()
     array = Array(away, np.array([(0, 0, 0), (0.5, 0, 0), (0, 0.5, 0)]), np.tile(K, (3, 1, 1)))
-    found = cell_depths(torch.randn(3, 4, ROWS, COLUMNS), array, 0, np.linspace(0.1, 0.5, 8))
+    found = cell_depths(torch.randn(3, 4, ROWS, COLUMNS), SIZE, array, 0, np.linspace(0.1, 0.5, 8))
     assert (found.confidence == 0).all()
+
+
+def test_padding_beyond_the_image_sees_nothing() -> None:
+    """The other two views see the first one's cells 5.6 px or more to the right."""
+    K = np.array([[70.0, 0, 40], [0, 70.0, 30], [0, 0, 1]])
+    centers = np.array([(0, 0, 0), (-0.1, 0, 0), (-0.1, 0, 0)])
+    array = Array(np.tile(np.eye(3), (3, 1, 1)), centers, np.tile(K, (3, 1, 1)))
+    fine, planes = torch.ones(3, 4, ROWS, COLUMNS), np.array([0.8, 1.0, 1.2])
+    whole, cut = (cell_depths(fine, size, array, 0, planes).confidence for size in (SIZE, (60, 70)))
+    seen = np.arange(COLUMNS) * 2 + 1 + 0.8 * 0.1 * 70
+    np.testing.assert_array_equal(whole > 0, np.tile(seen < 80, (ROWS, 1)))
+    np.testing.assert_array_equal(cut > 0, np.tile(seen < 70, (ROWS, 1)))
