@@ -38,15 +38,20 @@ class ImageBatch:
 
 
 def draw(files: Sequence[BurstFile], settings: ImageTraining, rng: np.random.Generator) -> ImageBatch:
-    """Return random samples of files of one image size."""
+    """Return random samples of files whose crops have one size."""
     parts: list[ImageBatch] = []
     for _ in range(settings.bursts):
         file = files[int(rng.integers(len(files)))]
         burst = file.read(int(rng.integers(len(file))))
-        images = burst.keys[len(burst.keys) // 2]
-        for v in rng.permutation(len(images))[: settings.views]:
+        for v in rng.permutation(len(burst.K))[: settings.views]:
             parts.append(_sample(burst, file, int(v), settings, rng))
     return joined(parts)
+
+
+def crop_size(size: tuple[int, int], settings: ImageTraining) -> tuple[int, int]:
+    """Return the size (h, w) of the parts that are taken of images of a size (H, W)."""
+    height, width = settings.crop
+    return min(size[0], height), min(size[1], width)
 
 
 def joined(parts: Sequence[ImageBatch]) -> ImageBatch:
@@ -63,7 +68,7 @@ def joined(parts: Sequence[ImageBatch]) -> ImageBatch:
 def _sample(burst: Burst, file: BurstFile, view: int, settings: ImageTraining, rng: np.random.Generator) -> ImageBatch:
     images = burst.keys[len(burst.keys) // 2]
     facts = file.facts
-    size = [min(*pair) for pair in zip(images.shape[1:], settings.crop, strict=True)]
+    size = crop_size((facts.height, facts.width), settings)
     under = drawn(False, settings, rng)
     if rng.random() < settings.well_lit:
         under = replace(under, light=float(rng.uniform(0.5, 1)))

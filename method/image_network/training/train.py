@@ -18,13 +18,14 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from spike4dgs.benchmark.environment import available_cores, device_type
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
 from spike4dgs.method.gaussians.optimizer import Adam
 from spike4dgs.method.image_network.config import MOVING_LOSS, ImageConfig, ImageTraining
 from spike4dgs.method.image_network.network import ImageNetwork, log_mse
-from spike4dgs.method.image_network.training.data import ImageBatch, draw
+from spike4dgs.method.image_network.training.data import ImageBatch, crop_size, draw
 from spike4dgs.method.image_network.weights import WEIGHTS
 from spike4dgs.method.models.network_weights import ConfigCard
 from spike4dgs.method.msdi.records import Curve, note_shards
@@ -71,8 +72,13 @@ class ImageNetworkTraining:
     ) -> None:
         """Begin at step 0, with random weights or with those of the file `start`.
 
-        Raises UserError for a damaged or foreign file, or one of another configuration.
+        Raises UserError for shards whose crops differ in size, and for a damaged or foreign file, or one of another
+        configuration.
         """
+        sizes = {crop_size((f.facts.height, f.facts.width), settings) for f in files}
+        if len(sizes) > 1:
+            found = ", ".join(f"{w}x{h}" for h, w in sorted(sizes))
+            raise problem("training bursts", "shards with room for crops of one size", found, "name those of one size")
         self.files, self.settings, self.device, self.seed = list(files), settings, device, seed
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)

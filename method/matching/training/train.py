@@ -48,8 +48,13 @@ class MatchTraining:
     ) -> None:
         """Begin at step 0, or at the step of the weights `start`, whose optimiser is found anew by a warm-up.
 
-        Raises UserError for a damaged or foreign file, or one of another configuration.
+        Raises UserError for shards of several image sizes, and for a damaged or foreign file, or one of another
+        configuration.
         """
+        sizes = {(f.facts.width, f.facts.height) for f in files}
+        if len(sizes) > 1:
+            found = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+            raise problem("training bursts", "shards of one image size", found, "name those of one size")
         self.files, self.settings, self.seed = list(files), settings, seed
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)

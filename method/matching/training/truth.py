@@ -38,7 +38,7 @@ def correspond(at: Tensor, depth: tuple[Tensor, Tensor], K: tuple[Tensor, Tensor
     uv = projected[:, :2] / projected[:, 2:].where(ahead[:, None], 1.0)
     inside = ahead & (uv >= 0).all(dim=1) & (uv < uv.new_tensor([width, height])).all(dim=1)
     u, v = uv.where(inside[:, None], 0.0).long().unbind(dim=1)
-    # The nearest of the four surfaces around the point: at an edge a pixel's centre may see either side.
+    # Any surface of the nine pixels around the point may be its own: at an edge a pixel's centre may see either side.
     surface = torch.stack(
         [depth[1][(v + j).clamp(0, height - 1), (u + i).clamp(0, width - 1)] for i in (-1, 0, 1) for j in (-1, 0, 1)]
     ).to(there)

@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
 
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.training_bursts import open_bursts
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
@@ -229,6 +230,16 @@ def test_a_killed_training_goes_on_with_the_same_bits(tmp_path: Path, files) -> 
     (tmp_path / "parts" / "images.safetensors").unlink()
     run(ImageNetworkTraining(files, TINY, SETTINGS, "cpu", 0), key, tmp_path / "parts")
     assert WEIGHTS.read_card(tmp_path / "parts" / "images.safetensors") == card
+
+
+def test_shards_must_have_room_for_crops_of_one_size(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]
+    larger = open_bursts(write_toy_shard(tmp_path, 13, width=48, height=32))
+    with pytest.raises(UserError, match="expected shards with room for crops of one size, found 32x24, 48x32"):
+        ImageNetworkTraining([*files, larger], TINY, SETTINGS, "cpu", 0)
+    both = [*files, larger]
+    small = replace(SETTINGS, crop=(24, 32))
+    assert draw(both, small, np.random.default_rng(1)).channels.shape[2:] == (24, 32)
+    ImageNetworkTraining(both, TINY, small, "cpu", 0)
 
 
 def test_a_training_begins_with_given_weights_and_their_shards(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]

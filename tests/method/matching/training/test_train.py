@@ -95,6 +95,12 @@ def test_the_losses_fall(files) -> None:  # type: ignore[no-untyped-def]
     assert np.mean([x.found for x in losses[-10:]]) > np.mean([x.found for x in losses[:10]])
 
 
+def test_shards_of_several_image_sizes_are_refused(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]
+    other = open_bursts(write_toy_shard(tmp_path, 13))
+    with pytest.raises(UserError, match="expected shards of one image size, found 32x24, 64x48"):
+        MatchTraining([*files, other], TINY, SETTINGS, 0)
+
+
 def test_a_killed_run_goes_on_with_the_same_bits_and_further(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]
     key = training_key(TINY, SETTINGS, 0)
     whole, parts = (MatchTraining(files, TINY, SETTINGS, 0) for _ in range(2))
