@@ -50,8 +50,8 @@ class Curve:
                 raise problem(path, "a table of numbers", f"damaged text ({e})", "delete it") from None
 
     def add(self, step: int, values: Row) -> None:
-        """Add a row."""
-        self.rows.append({"step": step, **values})
+        """Add a row, in place of those from that step on: a finished training may score its weights again."""
+        self.rows = [*(row for row in self.rows if row["step"] < step), {"step": step, **values}]
 
     def write(self) -> None:
         """Write the file."""

@@ -196,6 +196,8 @@ class Run:
         first, start = training.step, time.perf_counter()
         shown = saved = start
         recent: list[StepLosses] = []
+        if first == last:
+            self.export()  # a run that ended may lack them
         while training.step < last:
             recent.append(training.train_step())
             now, step = time.perf_counter(), training.step

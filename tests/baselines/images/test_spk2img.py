@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from resumed import check_resumed
+from resumed import check_resumed, same_tensors
 from slow_images import stream_of
 from small_scenes import GAIN, HEIGHT, WIDTH, add_gap, write_small_scene
 
@@ -141,6 +141,15 @@ def test_training_learns(small_scene: Path) -> None:
     training = train.Training(train.read_examples(train.open_for_training(small_scene)), SMALL, "cpu", seed=1)
     losses = [training.train_step() for _ in range(SMALL.steps)]
     assert np.mean(losses[-8:]) < 0.6 * np.mean(losses[:4])
+
+
+def test_a_step_without_a_finite_gradient_changes_nothing(small_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    training = train.Training(train.read_examples(train.open_for_training(small_scene)), SMALL, "cpu", seed=3)
+    before = {name: value.clone() for name, value in training.network.state_dict().items()}
+    monkeypatch.setattr(train, "loss_of", lambda found, *_: (found.rate * float("inf")).sum())
+    training.train_step()
+    assert training.step == 1
+    same_tensors(training.network.state_dict(), before)
 
 
 def test_a_resumed_training_gives_the_bits_of_one_that_never_stopped(small_scene: Path, tmp_path: Path) -> None:

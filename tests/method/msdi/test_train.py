@@ -216,9 +216,12 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
         rows = list(csv.DictReader(f))
     assert [row["step"] for row in rows] == ["3"]
 
-    before = path.read_bytes()
+    before, scores = path.read_bytes(), (out / "scores.csv").read_text()
+    path.unlink()
+    (out / "README.md").unlink()
     assert train_msdi(**arguments) == 0  # type: ignore[arg-type]
-    assert path.read_bytes() == before  # done already
+    assert path.read_bytes() == before and (out / "README.md").read_text() == text  # done already, but for these
+    assert (out / "scores.csv").read_text() == scores
 
     write_toy_shard(tmp_path / "more", 15)
     begun = {**arguments, "data": tmp_path / "more", "out": tmp_path / "begun", "start": path}
