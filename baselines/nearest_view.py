@@ -31,9 +31,9 @@ class NearestViewModel(Shown):
         distances = [float(np.linalg.norm(c.center - camera.center)) for c in self.scene.cameras]
         # Rounded to a micrometre: equals on paper must not be told apart by the last bit.
         nearest = int(np.argmin(np.round(distances, 6)))
-        stream, clock = self.scene.streams[nearest], self.scene.state(self.scene.cameras[nearest].id).clock
-        ticks, _ = local_ticks(clock, [self.scene.tick(t_us)], stream.n_ticks)
-        return self.images(stream, ticks, self.scene.radiance_gain)[0]
+        stream, state = self.scene.streams[nearest], self.scene.state(self.scene.cameras[nearest].id)
+        ticks, _ = local_ticks(state.clock, [self.scene.tick(t_us)], stream.n_ticks)
+        return self.images(stream, ticks, self.scene.radiance_gain * state.gain)[0]
 
 
 @dataclass(repr=False)

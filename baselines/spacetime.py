@@ -146,10 +146,15 @@ def _score(motion: Motion, gaussians: Gaussians, images: TrainingImages, view: i
 
 
 def bad_pixels(rendered: Tensor, image: Tensor) -> Tensor:
-    """Return indices into H * W of the pixels to sample, for a render and its training image [H, W]."""
+    """Return indices into H * W of the pixels to sample, for a render and its training image [H, W].
+
+    There are none in views that are smaller than a patch.
+    """
     height, width = image.shape
-    error = (rendered / rendered.mean() - image / image.mean()).abs()
     rows, columns = height // PATCH, width // PATCH
+    if rows * columns == 0:
+        return torch.zeros(0, dtype=torch.long, device=image.device)
+    error = (rendered / rendered.mean() - image / image.mean()).abs()
     error = error[: rows * PATCH, : columns * PATCH]
     worst = torch.quantile(error, BAD_PIXELS)
     patches = (error > worst).float().view(rows, PATCH, columns, PATCH).mean((1, 3)) > BAD_SHARE  # [rows, columns]

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from tyro.conf import Positional
 
 from spike4dgs.baselines.images.published.makers import FILES as PUBLISHED
-from spike4dgs.baselines.starts.dust3r import weight_file
+from spike4dgs.baselines.starts.dust3r import FILE as DUST3R
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.release.source import Source
@@ -16,7 +16,7 @@ from spike4dgs.benchmark.release.weights import fetch_weights
 from spike4dgs.benchmark.weights import ALEXNET, METAIQA, SQUEEZENET, VGG16, WeightFile
 from spike4dgs.cli.options import From
 
-OTHERS = {"lpips-vgg": VGG16, "lpips-squeeze": SQUEEZENET, "metaiqa": METAIQA, "dust3r": weight_file()}
+OTHERS = {"lpips-vgg": VGG16, "lpips-squeeze": SQUEEZENET, "metaiqa": METAIQA, "dust3r": DUST3R}
 FILES = {"lpips": ALEXNET, **OTHERS, **PUBLISHED}
 
 

@@ -66,11 +66,6 @@ class Dust3rSettings(Settings):
 DEFAULTS = Dust3rSettings()
 
 
-def weight_file() -> WeightFile:
-    """Return the facts of the weight file that `spike4dgs download weights` fetches."""
-    return FILE
-
-
 def weights_path() -> Path:
     """Return the weight file that users bring. Raises WeightsError where it is missing."""
     return find_weights(WEIGHTS).path
@@ -161,8 +156,10 @@ def solve(
 ) -> Start:
     """Return cameras and points from the network's answers; `views` are the training cameras at the size of `shown`.
 
-    Raises UserError where a view gets no pose.
+    Raises UserError for a single view, and where a view gets no pose.
     """
+    if len(views) < 2:
+        raise problem(f"DUSt3R on {scene.id}", "two training views or more", str(len(views)), "use rig")
     pairs = [predict(i) for i in range(1, len(views))]
     confidence = np.mean([p.confidence[0] for p in pairs], axis=0)
     sure = confidence >= np.quantile(confidence, settings.least_confidence)

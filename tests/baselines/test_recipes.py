@@ -12,6 +12,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, FitRequest, Recipe, find_methods
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.camera_state import CameraState
 from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import RecipeMethod
@@ -160,6 +161,10 @@ def test_nearest_view_is_the_nearest_training_cameras_tfp_in_any_order_of_camera
     )
     images = [m.render(scene.cameras["cam_03"], 2000.0) for m in (model, mixed)]
     np.testing.assert_array_equal(*images)
+    states = {"cam_02": CameraState(gain=1.25)}  # which counts more spikes of the same light
+    brighter = METHODS["nearest-view"].fit(dataclasses.replace(scene.training, states=states), FitRequest(TINY))
+    image = brighter.render(scene.cameras["cam_03"], 2000.0)
+    np.testing.assert_allclose(image, images[0] / 1.25, rtol=1e-6)
 
 
 @pytest.mark.parametrize("part", ["images", "initialization", "motion", "supervision"])

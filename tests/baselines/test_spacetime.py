@@ -275,6 +275,11 @@ def test_a_patch_needs_85_percent_of_bad_pixels() -> None:
     assert spacetime.BAD_PIXELS == 0.6
 
 
+def test_a_view_smaller_than_a_patch_has_no_bad_pixels() -> None:
+    for height, width in ((12, 64), (64, 12)):
+        assert spacetime.bad_pixels(torch.ones(height, width).cumsum(0), torch.ones(height, width)).shape == (0,)
+
+
 def wall(camera: Camera, distance: float) -> Splats:
     """Opaque Gaussians of random gray in a plane across a camera's view and beyond."""
     margin = camera.width // 4

@@ -126,6 +126,4 @@ def test_all_are_listed_without_a_name(capsys: pytest.CaptureFixture[str]) -> No
 def test_the_known_addresses() -> None:
     assert ALEXNET.address == ("https://download.pytorch.org/models", "alexnet-owt-7be5be79.pth")
     assert FILES["metaiqa"].address is None
-    from spike4dgs.baselines.starts.dust3r import weight_file
-
-    assert weight_file().address == ("hf://naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt", "model.safetensors")
+    assert FILES["dust3r"].address == ("hf://naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt", "model.safetensors")

@@ -183,6 +183,13 @@ def test_perfect_points_at_scales_of_their_own_give_the_poses(calibrated: bool) 
     assert np.corrcoef(start.values[inside], image[v, u])[0, 1] > 0.8
 
 
+def test_one_view_alone_is_refused() -> None:
+    scene = replace(WORLD.training, cameras=WORLD.training.cameras[:1], streams=WORLD.training.streams[:1])
+    view, shown = resized(scene.cameras[0], 16, SMALL.long_side_px), np.zeros((1, 48, 96), np.float32)
+    with pytest.raises(UserError, match="expected two training views or more, found 1"):
+        solve(lambda _: pytest.fail("no pair"), [view], shown, scene, 0, SMALL, calibrated=True)
+
+
 def test_images_reach_the_network_in_its_range() -> None:
     class Recorder(Dust3r):
         seen: list[Tensor] = []
