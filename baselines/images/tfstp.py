@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -66,13 +67,18 @@ def tfstp_image(stream: SpikeStream, tick: int, settings: TfstpSettings | None =
     """Return spikes per tick [H, W] float32 at the start of `tick`, from the states of the pixels' synapses."""
     s = settings or TfstpSettings()
     image = np.empty(stream.height * stream.width, np.float32)
-    gaps = np.arange(stream.n_ticks + 1)
-    decays = np.exp(-gaps[:, None] / np.array([s.f_ticks, s.d_ticks]))  # [gap, 2]
+    decays = _decays(stream.n_ticks, s.f_ticks, s.d_ticks)
     synapse = (float(s.u0), float(s.jump), float(s.d_ticks), float(s.f_ticks))  # one type for numba
     arguments = (rows(stream.packed), decays, synapse, s.memory_ticks, tick, image)
     in_threads(_image, len(image), *arguments, small=len(image) < 1 << 12)
     upright = image.reshape(stream.height, stream.width)
     return upright[::-1] if stream.rows_bottom_up else upright
+
+
+@lru_cache(maxsize=4)  # all images of a clip need the same, and it is longer to make than an image of a long clip
+def _decays(n_ticks: int, f_ticks: float, d_ticks: float) -> Float64:
+    """Return what F and D leave after gaps of 0 ... n_ticks [n_ticks + 1, 2]. Nobody writes into it."""
+    return np.exp(-np.arange(n_ticks + 1)[:, None] / np.array([f_ticks, d_ticks]))
 
 
 @kernel

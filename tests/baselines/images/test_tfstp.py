@@ -12,7 +12,7 @@ from slow_images import slow_tfstp_pixel, stream_of
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.images.tfi import tfi_image
 from spike4dgs.baselines.images.tfp import tfp_image
-from spike4dgs.baselines.images.tfstp import TfstpSettings, tfstp_image
+from spike4dgs.baselines.images.tfstp import TfstpSettings, _decays, tfstp_image
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 
@@ -36,6 +36,15 @@ def test_images_equal_the_published_equations(n: int, height: int, width: int, b
         assert image.dtype == np.float32 and image.shape == (height, width)
         expected = [slow_tfstp_pixel(list(np.flatnonzero(s)), n, tick) for s in spikes.reshape(n, -1).T]
         np.testing.assert_allclose(image.ravel(), expected, rtol=1e-6)
+
+
+def test_the_decays_of_a_clip_are_computed_once_for_all_its_images() -> None:
+    stream = one_row(50, [3, 20, 41])
+    _decays.cache_clear()
+    images = [tfstp_image(stream, tick) for tick in (10, 25, 40)]
+    assert _decays.cache_info().misses == 1
+    _decays.cache_clear()
+    np.testing.assert_array_equal(images[1], tfstp_image(stream, 25))
 
 
 def test_other_constants_are_settings_of_the_maker() -> None:
