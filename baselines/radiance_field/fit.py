@@ -134,11 +134,10 @@ class Fitter:
             deformation=planes,
         )
         bounds = bounds_of(start.cameras, start.points, extent.low, extent.high, extent.scale)
-        gain = job.scene.radiance_gain
-        self.field = DynamicField(shape, bounds, 1 / gain, seeded(request.seed, -1)).to(request.device)
+        generator = seeded(request.seed, -1)
+        self.field = DynamicField(shape, bounds, 1 / job.scene.radiance_gain, generator).to(request.device)
         views = [camera_rays(c, request.device) for c in start.cameras]
         self.rays = Rays(torch.cat([r.origins for r in views]), torch.cat([r.directions for r in views]))
-        self.recorded = (job.training_images.images * gain).flatten(1)  # [T, C * H * W] mean spikes per tick
         self._begin_grid()
         field, grid, mlp = self.field.parameter_groups()
         self.adam = Adam({"field": field, "grid": grid, "deformation": mlp}, (s.beta1, s.beta2))
@@ -150,8 +149,9 @@ class Fitter:
 
     def _begin_grid(self) -> None:
         """Tell the occupancy grid where there are points, and where something may move."""
-        start, shape = self.job.start, self.job.training_images.images.shape
-        moving = changing(self.recorded.unflatten(1, shape[1:]), RAYS).cpu().numpy()
+        start = self.job.start
+        recorded = self.job.training_images.images * self.job.scene.radiance_gain  # [T, C, H, W] mean spikes per tick
+        moving = changing(recorded, RAYS).cpu().numpy()
         points = torch.as_tensor(start.points, device=self.job.request.device)
         self.field.occupancy.begin(points, may_move(self.field.occupancy, start.cameras, moving))
 
@@ -166,7 +166,7 @@ class Fitter:
         """Return the spike loss of both fields on random rays of one time, and the planes' regulariser."""
         s, spiking, job = self.settings, self.spiking, self.job
         index = self.choose_time()
-        pixels = torch.randint(len(self.rays), (s.rays,), generator=generator).to(self.recorded.device)
+        pixels = torch.randint(len(self.rays), (s.rays,), generator=generator).to(job.training_images.images.device)
         recorded = job.training_images.measured(index).flatten()[pixels] * job.scene.radiance_gain
         images = self.field.trace(
             self.rays[pixels], job.training_images.ticks[index] / job.training_images.n_ticks, generator

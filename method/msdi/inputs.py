@@ -1,12 +1,9 @@
 """Inputs of MSDI's networks: corrected spikes, rates estimated from each pixel's own spikes, streams of larger pixels.
 
-Streams of larger pixels, for a network that was trained at low resolution.
-
-Attention costs the square of the number of patches, and a network works best at the size of its training. A stream
-cannot be resized like an image, but the spikes of several pixels can charge one larger pixel, which fires whenever the
-sum makes a whole spike for each of them. This is again a stream of 0 and 1, of the mean rate to within one spike.
-
-Inputs of MSDI's networks: spikes corrected to an ideal sensor, and rates estimated from each pixel's own spikes.
+Streams of larger pixels are for a network that was trained at low resolution. Attention costs the square of the number
+of patches, and a network works best at the size of its training. A stream cannot be resized like an image, but the
+spikes of several pixels can charge one larger pixel, which fires whenever the sum makes a whole spike for each of them.
+This is again a stream of 0 and 1, of the mean rate to within one spike.
 
 A network of few layers can learn to count spikes, but hardly to measure the time between them, which is the better
 estimate of a bright pixel. BCONV therefore gets these rates (1.3 dB after three minutes of training). A window of h

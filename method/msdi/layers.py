@@ -1,8 +1,6 @@
 """Layers of DUSt3R and Fast3R: pre-norm transformer blocks, and the head that gives a point and a confidence per pixel.
 
-The head of DUSt3R and Fast3R (Ranftl et al. 2021): tokens of four layers to a point and a confidence per pixel.
-
-Parameters are named as in the published weights of both.
+The head (Ranftl et al. 2021) takes tokens of four layers. Parameters are named as in the published weights of both.
 """
 
 from __future__ import annotations

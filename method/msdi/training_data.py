@@ -1,12 +1,9 @@
 """Training batches of MSDI: windows of spikes with their images, points and cameras, drawn from bursts.
 
-Spikes made on the fly from a burst's images: a window of the simulated cameras.
-
-The model is that of `benchmark.spikes.sensor_model`; a pixel's charge before the window is uniform. Charge is float64
-here, and radiance is linear between the images, which lie at tick boundaries, so that no tick spans two pieces. The
-scenes' simulator (`generators.sensor`: integer charge, cubic curve between key frames) is the exact twin.
-
-Training batches of MSDI: windows of spikes with their images, points and cameras, drawn from bursts.
+Spikes are made on the fly from a burst's images, by the model of `benchmark.spikes.sensor_model`; a pixel's charge
+before the window is uniform. Charge is float64 here, and radiance is linear between the images, which lie at tick
+boundaries, so that no tick spans two pieces. The scenes' simulator (`generators.sensor`: integer charge, cubic curve
+between key frames) is the exact twin.
 
 Everything that can vary without another rendering is random at every use: the views and their order (the first one's
 frame is that of the points), the sensors' noise, phases and maps, the brightness, the direction of time, and whether
