@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 from range_server import Behaviour, serve
 
+from spike4dgs.baselines.starts.dust3r import FILE as DUST3R
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.release.source import Patience, Source
 from spike4dgs.benchmark.release.transfer import PIECE
@@ -126,4 +127,4 @@ def test_all_are_listed_without_a_name(capsys: pytest.CaptureFixture[str]) -> No
 def test_the_known_addresses() -> None:
     assert ALEXNET.address == ("https://download.pytorch.org/models", "alexnet-owt-7be5be79.pth")
     assert FILES["metaiqa"].address is None
-    assert FILES["dust3r"].address == ("hf://naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt", "model.safetensors")
+    assert DUST3R.address == ("hf://naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt", "model.safetensors")
