@@ -1,16 +1,12 @@
 """Other sensors that film the same scene: a conventional camera of 60 fps, and an event camera.
 
-A conventional 60 fps camera of the same scene: each frame is the mean radiance over its exposure (real blur).
+A frame is the mean radiance over its exposure (real blur). The mean is exact for the simulator's curve between keys
+(see `sensor.model`) up to its clamp: the integral of its cubic, also where an exposure begins or ends inside an
+interval.
 
-The mean is exact for the simulator's curve between keys (see `sensor.model`) up to its clamp: the curve's integral over
-whole key intervals is their trapezoid plus (m1 - m2) n / 12, and an exposure that begins or ends inside an interval
-uses the mean radiance of each tick.
-
-An event camera of the same scene: an event whenever a pixel's log radiance has changed by the threshold.
-
-Contrast-threshold model (as in ESIM, Rebecq et al. 2018). Each pixel stores the log radiance of its last event, at
-first that of the first key. Whenever the log radiance is a whole threshold away, the pixel fires a positive or negative
-event. Between keys log radiance is linear in time; times are microseconds, rounded down.
+Events follow the contrast-threshold model (as in ESIM, Rebecq et al. 2018). Each pixel stores the log radiance of its
+last event, at first that of the first key. Whenever the log radiance is a whole threshold away, the pixel fires a
+positive or negative event. Between keys log radiance is linear in time; times are microseconds, rounded down.
 
 Both are free of noise unless they are given some: `FrameNoise`, `EventNoise`.
 """

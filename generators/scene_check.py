@@ -1,14 +1,8 @@
-"""The check of made scenes against a reference: equal, rendering noise, or a change of the world; its report.
-
-The verdict on a scene and its reference: equal, rendering noise, or a change of the world.
-
-A second rendering of the made scene, with other noise and nothing else changed, gives the floor. What differs from the
-reference as much as from that rendering differs by noise.
-
-The check of made scenes against a reference, such as a release.
+"""The check of made scenes against a reference, such as a release: equal, rendering noise, or a change of the world.
 
 A scene whose revision is another one is rendered once more, with other noise of the rendering and nothing else changed.
-That scene, OUT/.noise/ID/REVISION/ID, says how much noise alone changes of the scene of this revision.
+That scene, OUT/.noise/ID/REVISION/ID, gives the floor of this revision: what differs from the reference as much as from
+it differs by noise.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """How far two scenes of the same cameras and clock are apart: facts that no noise changes, and what noise changes.
 
-Facts of two scenes that no noise changes: clock, cameras, splits, targets, geometry, sensors.
-
-Numbers that differ by rounding alone count as equal: another processor or library may round otherwise.
-
-How much two scenes of the same cameras and clock differ in what noise changes: spikes and truth.
-
-Noise is independent from pixel to pixel and so falls in the means of blocks; a change of the world does not.
+No noise changes clock, cameras, splits, targets, geometry and sensors. Numbers of these that differ by rounding alone
+count as equal: another processor or library may round otherwise. Noise changes spikes, truth and masks. It is
+independent from pixel to pixel and so falls in the means of blocks; a change of the world does not.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""The truth of a scene: ground truth on disk, its noise, and the audit of the radiance that the sensors received.
-
-`make-dataset --audit`: the error of the radiance that the sensors received, and the noise of it and of ground truth.
+"""Ground truth on disk, and `make-dataset --audit`: errors of the radiance that the sensors received, noise of both.
 
 At random ticks, mostly between keys, Mitsuba's own render loop renders some views whole with up to four times the
 samples of a key; they are compared with the interpolated radiance of that instant. The reference's noise counts as

@@ -1,14 +1,12 @@
 """Rigs that resemble a world's own, and the rendering of training bursts that they see at a few instants.
 
-Rigs that resemble a world's own: another viewpoint, lens and distances, and cameras slightly out of position.
+The rigs have another viewpoint, lens and distances, and cameras slightly out of position. A network that is trained on
+one rig memorises that rig, so the worlds' own rigs are not in the training data.
 
-A network that is trained on one rig memorises that rig, so the worlds' own rigs are not in the training data.
-
-Rendering of training bursts: a rig's background once, and around each instant only moving objects, at a few ticks.
-
-Less exact than `rendering.render`, and much cheaper: fewer samples, and without the light that moving objects throw far
-around them. Training is not misled, because truth and spikes come from the same images. As there, pixels that see only
-the shadow of a moving object are the background plus the difference of two renderings with the same random numbers.
+A rig's background is rendered once, and around each instant only moving objects are, at a few ticks: less exact than
+`rendering.render`, and much cheaper, with fewer samples and without the light that moving objects throw far around
+them. Training is not misled, because truth and spikes come from the same images. As there, pixels that see only the
+shadow of a moving object are the background plus the difference of two renderings with the same random numbers.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.render import StaticViews
+from spike4dgs.generators.sensor.light import tick_mean
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -189,13 +190,7 @@ class _Means(Sequence[Float32]):
         return self._n
 
     def __getitem__(self, tick: Any) -> Any:
-        keys = self._instants
-        p1, p2 = keys[tick], keys[tick + 1]
-        p0, p3 = (keys[tick - 1] if tick else p1), (keys[tick + 2] if tick + 2 < len(keys) else p2)
-        weight1, weight2 = (0.5 if tick else 1.0), (0.5 if tick + 2 < len(keys) else 1.0)
-        m1, m2 = np.float32(weight1) * (p2 - p0), np.float32(weight2) * (p3 - p1)
-        mean = (p1 + p2) * np.float32(0.5) + (m1 - m2) * np.float32(1 / 12)
-        mean = np.clip(mean, np.minimum(p1, p2), np.maximum(p1, p2))
+        mean = tick_mean(self._instants.__getitem__, tick, len(self._instants) - 1)
         mask, values = self._store.given(tick, self._view, "mean_")
         mean[mask] = values
         return mean

@@ -104,13 +104,15 @@ class FlickeringMeans(Sequence[Float32]):
         return self._n
 
     def __getitem__(self, tick: Any) -> Any:  # one tick; slices are not needed
-        steady = self._steady(tick) if self._means is None else self._means[tick]
+        steady = tick_mean(self._at, tick, self._n) if self._means is None else self._means[tick]
         return steady * np.float32(self._light.mean(tick))
 
-    def _steady(self, tick: int) -> Float32:
-        p1, p2 = self._at(tick), self._at(tick + 1)
-        before, after = (self._at(tick - 1) if tick else p1), (self._at(tick + 2) if tick + 2 <= self._n else p2)
-        m1 = (p2 - before) * np.float32(0.5 if tick else 1.0)
-        m2 = (after - p1) * np.float32(0.5 if tick + 2 <= self._n else 1.0)
-        mean = (p1 + p2) * np.float32(0.5) + (m1 - m2) * np.float32(1 / 12)
-        return np.asarray(np.clip(mean, np.minimum(p1, p2), np.maximum(p1, p2)))
+
+def tick_mean(at: Callable[[int], Float32], tick: int, last: int) -> Float32:
+    """Return the mean over a tick of the clamped curve through the radiance at the starts of ticks 0 .. last."""
+    p1, p2 = at(tick), at(tick + 1)
+    before, after = (at(tick - 1) if tick else p1), (at(tick + 2) if tick + 2 <= last else p2)
+    m1 = (p2 - before) * np.float32(0.5 if tick else 1.0)
+    m2 = (after - p1) * np.float32(0.5 if tick + 2 <= last else 1.0)
+    mean = (p1 + p2) * np.float32(0.5) + (m1 - m2) * np.float32(1 / 12)
+    return np.asarray(np.clip(mean, np.minimum(p1, p2), np.maximum(p1, p2)))
