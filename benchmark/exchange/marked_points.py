@@ -6,6 +6,7 @@ x and y are pixels as OpenCV and the trackers of keypoints count them: 0, 0 is t
 from __future__ import annotations
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,14 +36,16 @@ class MarkedPoints:
 def read_marked_points(path: Path) -> MarkedPoints:
     """Read a CSV with a head line. Raises UserError for other columns, bad numbers, and a point marked twice."""
     try:
-        rows = list(csv.reader(read_text(path, _WHAT, _MOST_BYTES).splitlines()))
+        text = read_text(path, _WHAT, _MOST_BYTES).removeprefix("\ufeff")  # spreadsheets write it first
+        reader = csv.reader(io.StringIO(text, newline=""))
+        rows = [(reader.line_num, row) for row in reader if row]
     except (ValueError, csv.Error) as e:
         raise problem(path, f"{_WHAT} (CSV)", f"damaged text ({str(e)[:200]})", "write it again") from None
-    if not rows or tuple(rows[0]) != COLUMNS:
-        found = shown(",".join(rows[0]) if rows else "")
+    if not rows or tuple(rows[0][1]) != COLUMNS:
+        found = shown(",".join(rows[0][1]) if rows else "")
         raise problem(path, f"a head line {','.join(COLUMNS)}", found, "write these columns")
     cameras, points, uv, known = [], [], [], set()
-    for line, row in enumerate(rows[1:], start=2):
+    for line, row in rows[1:]:
         try:
             camera, frame, point, x, y = row
             at = float(x) + CENTRE, float(y) + CENTRE

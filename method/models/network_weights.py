@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path, sha256_file
 from spike4dgs.benchmark.json_values.text import parse_json
+from spike4dgs.benchmark.untrusted import shown
 from spike4dgs.benchmark.weights import FoundWeights, NamedWeights, find_weights, load_into, read_header, read_tensors
 
 if TYPE_CHECKING:
@@ -81,7 +82,10 @@ class WeightKind(Generic[CardT]):
         text = read_header(path, self.schema, self.description, self.fix)
         try:
             fields: dict[str, Any] = parse_json(text)
-            card = self.card(**{**fields, "trained_on": tuple(fields["trained_on"])})
+            seen = fields["trained_on"]
+            if not isinstance(seen, list) or not all(isinstance(name, str) for name in seen):
+                raise ValueError(f"trained_on is {shown(seen)}, no list of texts")
+            card = self.card(**{**fields, "trained_on": tuple(seen)})
         except (LookupError, TypeError, ValueError) as e:
             raise problem(path, self.description, f"damaged data in its card ({e})", self.fix) from None
         return card
@@ -116,10 +120,13 @@ class ConfigWeights(WeightKind[ConfigCardT]):
     configs: Collection[str] = ()  # their names
 
     def read_card(self, path: Path) -> ConfigCardT:
-        """Return the file's card. Raises UserError also for a configuration that is not known."""
+        """Return the file's card. Raises UserError also for an unknown configuration, and steps that are no number."""
         card = super().read_card(path)
-        if card.config not in self.configs:
-            raise problem(path, f"a configuration of {', '.join(self.configs)}", repr(card.config), self.fix)
+        if card.config not in tuple(self.configs):  # a foreign one may be no key
+            raise problem(path, f"a configuration of {', '.join(self.configs)}", shown(card.config), self.fix)
+        if type(card.steps) is not int or type(card.seed) is not int:
+            found = f"{shown(card.steps)} and {shown(card.seed)}"
+            raise problem(path, "whole numbers as steps and seed", found, self.fix)
         return card
 
     def load(self, path: Path, device: str, build: Callable[[str], NetworkT]) -> NetworkT:

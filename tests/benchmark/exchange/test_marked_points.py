@@ -19,6 +19,13 @@ def test_pixel_centres_move_from_whole_numbers_to_a_half(tmp_path: Path) -> None
     np.testing.assert_array_equal(found.uv, [[10.5, 21], [-0.5, 3.5]])
 
 
+def test_files_of_spreadsheets(tmp_path: Path) -> None:
+    """A byte order mark, empty lines, and cells of several lines."""
+    rows = 'cam_0,0,"left\nknee",10,20.5\r\n\r\ncam_1,0,\u2028,-1,3\r\n\r\n'
+    (tmp_path / "points.csv").write_bytes(("\ufeff" + HEAD + rows).encode())
+    assert read_marked_points(tmp_path / "points.csv").of == (("0", "left\nknee"), ("0", "\u2028"))
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -30,6 +37,7 @@ def test_pixel_centres_move_from_whole_numbers_to_a_half(tmp_path: Path) -> None
         (HEAD + "cam_0,0,knee,1,1e12\n", "line 2"),
         (HEAD + "cam_0,0,knee,1,2\ncam_0,0,knee,1,3\n", "line 3: expected a point once in a frame"),
         (HEAD + "cam_0,0,\0,1,x\n", "line 2"),
+        (HEAD + '\ncam_0,0,"a\nb",1,x\n', "line 4"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, text: str | None, expected: str) -> None:

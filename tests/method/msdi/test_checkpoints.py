@@ -1,7 +1,7 @@
 """Published weights of Fast3R and DUSt3R, and MSDI's own weight files."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -198,6 +198,17 @@ def test_damaged_and_foreign_weights_are_refused(tmp_path: Path) -> None:
     WEIGHTS.save(path, fresh(TINY), replace(CARD, config="huge"))
     with pytest.raises(UserError, match="a configuration of paper, small, tiny, found 'huge'"):
         WEIGHTS.read_card(path)
+    for key, value, message in (
+        ("config", ["tiny"], r"a configuration of paper, small, tiny, found \['tiny'\]"),
+        ("trained_on", "abc", "trained_on is 'abc', no list of texts"),
+        ("trained_on", [1], r"trained_on is \[1\], no list of texts"),
+        ("steps", "12", "whole numbers as steps and seed, found '12' and 3"),
+        ("seed", None, "whole numbers as steps and seed, found 12 and None"),
+    ):
+        card = json.dumps({**asdict(CARD), key: value})
+        save_file({"weight": torch.zeros(1)}, path, metadata={"spike4dgs-msdi/1": card})
+        with pytest.raises(UserError, match=message):
+            WEIGHTS.read_card(path)
     other = tmp_path / "other.safetensors"
     WEIGHTS.save(other, fresh(replace(TINY, fusion_width=8)), CARD)
     with pytest.raises(UserError, match="parameters of configuration tiny"):
