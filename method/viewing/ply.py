@@ -7,10 +7,16 @@ Viewers show 0.5 + SH_C0 * f_dc as a display value, clipped to [0, 1]. So f_dc i
 same in all three channels. `srgb` is continued above 1 and below 0, so that no radiance is lost. Our renderer blends
 radiance and then encodes; a viewer blends what is encoded. Opaque surfaces look the same, half-transparent edges differ
 a little.
+
+Viewers blur each Gaussian by 0.3 px^2 (`types.CUSTOMARY`) and let it grow brighter by that. A model that was fitted
+with another filter has its opacities scaled, so that a Gaussian gives as much light as in the model's own images from
+the training cameras. Its small Gaussians still look softer.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +26,12 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import check_new, write_bytes
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.models.fitted_model import GaussianModel
 from spike4dgs.method.models.saved_model import SavedModel, load_model
-from spike4dgs.method.splat import Splats
-from spike4dgs.method.splat.types import ALPHA_MIN
+from spike4dgs.method.splat import PixelFilter, Splats, Views
+from spike4dgs.method.splat.reference import project_view
+from spike4dgs.method.splat.types import ALPHA_MIN, CUSTOMARY
 
 FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -47,13 +55,36 @@ def write_ply(model: Path, out: Path, times: int, device: str = "cpu") -> tuple[
         raise problem("--times", f"1 to {about.n_ticks}, the ticks of the clip", str(times), "correct it")
     ticks = [(2 * i + 1) * about.n_ticks // (2 * times) for i in range(times)]
     check_new(out)
+    if (own := fitted.pixel_filter) != CUSTOMARY:
+        kind = "compensated" if own.compensated else "plain"
+        print(f"{model}: fitted with a {kind} filter of {own.variance:.3g} px^2; opacities are scaled to viewers' 0.3")
     for tick in ticks:
         splats = fitted.splats(tick * 1e6 / about.rate_hz)
         if splats.colors.shape[1] != 1:
             found = f"{about.name}, whose colours a network decodes for each ray"
             raise problem(model, "Gaussians with a gray value", found, "fit the motion spacetime-lite")
-        write_bytes(out / f"{tick:06d}.ply", to_ply(splats))
+        write_bytes(out / f"{tick:06d}.ply", to_ply(for_viewers(splats, about.cameras, own)))
     return saved, ticks
+
+
+@torch.no_grad()
+def for_viewers(splats: Splats, cameras: Sequence[Camera], own: PixelFilter) -> Splats:
+    """Return Gaussians that give with the customary filter the light that they give with the filter of their model.
+
+    The light goes as opacity sqrt(|S|), with S the covariance in a camera's image. That includes the filter, but not a
+    compensated one: its opacities fall as sqrt(|S|) grows. The median over the cameras that see a Gaussian decides.
+    """
+    if own == CUSTOMARY:
+        return splats
+    wide, views = Splats(*(t.double().cpu() for t in splats.tensors)), Views.from_cameras(cameras)
+    shares = torch.full((len(cameras), len(splats)), torch.nan, dtype=torch.float64)
+    less = CUSTOMARY.variance - (0.0 if own.compensated else own.variance)
+    for view, share in enumerate(shares):
+        seen = project_view(wide, views, view, CUSTOMARY)
+        det = seen.det - less * (seen.cov[:, 0] + seen.cov[:, 2]) + less**2  # of the covariance less a filter
+        share[seen.index] = (det.clamp(min=0) / seen.det).sqrt()
+    share = shares.nanmedian(0).values.nan_to_num(1.0)
+    return replace(splats, opacities=splats.opacities * share.to(splats.opacities))
 
 
 @torch.no_grad()

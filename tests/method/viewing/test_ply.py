@@ -1,5 +1,6 @@
 """The files of `export-ply`, read by a reader of its own: rendered again they give the model's images."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ from saved_models import DURATION_US, WORLD, model, provenance
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.cli import main
-from spike4dgs.method.splat import Splats, Views, render
-from spike4dgs.method.viewing.ply import to_ply, write_ply
+from spike4dgs.method.gaussians.parameters import Gaussians
+from spike4dgs.method.splat import PixelFilter, Splats, Views, render
+from spike4dgs.method.viewing.ply import for_viewers, to_ply, write_ply
 
 FIELDS = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
 
@@ -68,6 +70,36 @@ def test_the_files_render_as_the_model_does(saved: Path, tmp_path: Path, request
         found = render(activated(vertices), Views.from_cameras([camera])).image[0, ..., 0].clamp(min=0).numpy()
         assert expected.max() > 0.1
         np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_a_compensated_filters_light_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The viewers' filter makes Gaussians of about a pixel brighter, here by 13.6 % in all."""
+
+    def small(g: Gaussians) -> Gaussians:
+        return replace(g, log_scales=g.log_scales + np.log(0.25))
+
+    made = model("hexplane, background")
+    pieces, background = tuple(small(piece) for piece in made.pieces), small(made.background)
+    made = replace(made, pieces=pieces, background=background, pixel_filter=PixelFilter(1 / 12, True))
+    made.save(tmp_path / "model", provenance())
+    assert main(["export-ply", str(tmp_path / "model"), "--out", str(tmp_path / "out"), "--times", "1"]) == 0
+    assert "fitted with a compensated filter of 0.0833 px^2" in capsys.readouterr().out
+    expected = made.render(WORLD.held_out, 0.5 * DURATION_US)
+
+    def errors(splats: Splats) -> tuple[float, float]:
+        with torch.no_grad():
+            found = render(splats, Views.from_cameras([WORLD.held_out])).image[0, ..., 0].clamp(min=0).numpy()
+        return abs(found.mean() / expected.mean() - 1), float(np.square(found - expected).mean())
+
+    light, error = errors(activated(read_ply(tmp_path / "out/000050.ply")))
+    light_before, error_before = errors(made.splats(0.5 * DURATION_US))
+    assert light < 0.01 < 0.1 < light_before
+    assert error < error_before / 3, "5 dB"
+    seen, one = torch.tensor([[0.0, 0.3, 0.7]]), torch.ones(1)
+    tiny = for_viewers(
+        Splats(seen, torch.ones(1, 4), torch.full((1, 3), 1e-5), one, one[None]), WORLD.cameras, made.pixel_filter
+    )
+    assert tiny.opacities[0] < 1e-3, "what is far smaller than a pixel gives no light"
 
 
 def test_extreme_gaussians_stay_finite_and_faded_ones_are_left_out(tmp_path: Path) -> None:
