@@ -9,6 +9,9 @@ all pixels and images. The window is separable; the gradient needs three more bl
 
 with m the blurred images, q the blurred squares and product. This is the training loss; scores come from
 `spike4dgs.benchmark.metrics.table`, which leaves out the border instead of padding it.
+
+The kernels' float32 is for light of about [0, 1]. In D the squares of the light cancel: in flat parts at 10 times
+white the gradient errs by 4 %, at 100 times by 60 %.
 """
 
 from __future__ import annotations

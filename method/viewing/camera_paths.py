@@ -22,6 +22,7 @@ Path = Callable[[float], Camera]
 PathName = Literal["orbit", "rig", "still"]
 ALONE = 0.05  # radius of the orbit around a single camera, in distances to the focus
 FAR = 5.0  # distance of the focus of cameras whose axes never meet, in radii of the array
+CANCEL = 0.1  # length of a mean of unit axes below which they cancel, as of cameras that stand around a scene
 PARALLEL = 1e-4  # smallest eigenvalue, per camera, below which axes count as parallel: about half a degree
 
 
@@ -38,10 +39,12 @@ def focus(cameras: Sequence[Camera]) -> Float64:
     """Return the point [3] that is nearest to all optical axes, the middle of the scene.
 
     It minimises sum |(I - d d^T) (x - c)|^2 over x. If the axes are parallel, or meet behind the array, it is a point
-    on the mean axis, five of the array's radii away.
+    on the mean axis, five of the array's radii away. Where axes cancel, the middle camera's counts as the mean.
     """
     centers, axes = np.stack([c.center for c in cameras]), np.stack([c.R[2] for c in cameras])
-    middle, forward = centers.mean(0), axes.mean(0) / np.linalg.norm(axes.mean(0))
+    facing = _agreeing(cameras, 2)
+    middle, forward = (np.mean(vectors, axis=0) for vectors in ([c.center for c in facing], [c.R[2] for c in facing]))
+    forward = forward / np.linalg.norm(forward)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3]
     total = across.sum(0)
     if np.linalg.eigvalsh(total)[0] > PARALLEL * len(cameras):
@@ -52,10 +55,20 @@ def focus(cameras: Sequence[Camera]) -> Float64:
     return np.asarray(middle + FAR * radius * forward)
 
 
+def _agreeing(cameras: Sequence[Camera], axis: int) -> Sequence[Camera]:
+    """Return the cameras; the middle one alone where their axes, rows of R, cancel."""
+    mean = np.mean([c.R[axis] for c in cameras], axis=0)
+    return cameras if np.linalg.norm(mean) >= CANCEL else (fixed(cameras)(0.0),)
+
+
 def orbit(cameras: Sequence[Camera]) -> Path:
-    """Return a closed ellipse as wide and as high as the array, around its middle, directed at the focus."""
-    centers, target = np.stack([c.center for c in cameras]), focus(cameras)
-    middle, up = centers.mean(0), -np.mean([c.R[1] for c in cameras], axis=0)
+    """Return a closed ellipse as wide and as high as the array, around its middle, directed at the focus.
+
+    Of cameras that stand around the scene it is the middle one's alone.
+    """
+    target, cameras = focus(cameras), _agreeing(cameras, 2)
+    centers = np.stack([c.center for c in cameras])
+    middle, up = centers.mean(0), -np.mean([c.R[1] for c in _agreeing(cameras, 1)], axis=0)
     first = look_at("orbit", middle, target, up, focal=1.0, width=1, height=1)
     right, down = first.R[0], first.R[1]
     reach = [float(np.abs((centers - middle) @ axis).max()) for axis in (right, down)]

@@ -77,7 +77,10 @@ def window(tick: int, n_ticks: int) -> tuple[int, int]:
 
 
 def open_content(saved: SavedModel, scene: Path | None, allow_gaps: bool = False) -> Content:
-    """Return the content of a model and its scene's training views. Raises UserError for another scene's folder."""
+    """Return the content of a model and its scene's training views. Raises UserError for another scene's folder.
+
+    Another revision of the scene is said only: a model may have been fitted to the training part alone.
+    """
     if scene is None:
         return Content(saved)
     about = saved.provenance
@@ -90,7 +93,11 @@ def open_content(saved: SavedModel, scene: Path | None, allow_gaps: bool = False
         found = f"{opened.n_ticks} ticks at {opened.rate_hz:g} Hz, cameras {', '.join(opened.train)}"
         expected = f"{about.n_ticks} ticks at {about.rate_hz:g} Hz, cameras {', '.join(c.id for c in about.cameras)}"
         raise problem(scene, expected, found, "give the scene that the model was fitted to")
-    return Content(saved, opened.training)
+    training = opened.training
+    if training.revision != about.scene_revision:
+        found, fitted = training.revision[:16], about.scene_revision[:16]
+        print(f"{scene}: revision {found}; the model was fitted to revision {fitted}, whose spikes may be others")
+    return Content(saved, training)
 
 
 def _gray(image: Float32) -> UInt8:

@@ -73,7 +73,7 @@ def render_video(
         if out is not None:
             writers.append(stack.enter_context(video_writer(out, size, fps)))
         if frames is not None:
-            writers.append(png_writer(frames))
+            writers.append(png_writer(frames, len(times)))
         for image in _shown(render_frames(saved, path, times, playback.scale), len(times), saved.title):
             for write in writers:
                 write(image)
@@ -94,10 +94,10 @@ def render_frames(saved: SavedModel, path: camera_paths.Path, times: list[float]
         yield encode_srgb(saved.model.render(camera, t_us))
 
 
-def png_writer(folder: Path) -> Write:
-    """Return a function that writes frames as FOLDER/00000.png and so on."""
-    count = iter(range(10**9))
-    return lambda image: write_png(folder / f"{next(count):05d}.png", image)
+def png_writer(folder: Path, count: int) -> Write:
+    """Return a function that writes `count` frames as FOLDER/00000.png and so on, with names of one length."""
+    numbers, digits = iter(range(count)), max(5, len(str(count - 1)))
+    return lambda image: write_png(folder / f"{next(numbers):0{digits}d}.png", image)
 
 
 def _shown(frames: Iterator[UInt8], total: int, title: str) -> Iterator[UInt8]:

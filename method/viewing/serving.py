@@ -59,9 +59,24 @@ def is_own(origin: str | None, asked: str | None, host: str) -> bool:
     >>> is_own("https://a.example", "localhost:8080", "127.0.0.1")
     False
     """
-    if host in _LOOPBACK and urlsplit(f"//{asked or ''}").hostname not in _LOOPBACK:
+    try:
+        named, page = urlsplit(f"//{asked or ''}"), urlsplit(origin or "")
+    except ValueError:  # such as "[::1", half an address
         return False
-    return origin is None or urlsplit(origin).netloc == asked
+    if host in _LOOPBACK and named.hostname not in _LOOPBACK:
+        return False
+    return origin is None or page.netloc.lower() == named.netloc.lower()
+
+
+def url_of(host: str, port: int) -> str:
+    """Return the address of a server for a browser of this machine.
+
+    >>> url_of("0.0.0.0", 8080), url_of("::1", 8080)
+    ('http://localhost:8080', 'http://[::1]:8080')
+    """
+    if host in ("127.0.0.1", "0.0.0.0", "::"):
+        host = "localhost"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 @contextmanager

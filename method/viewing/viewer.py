@@ -17,7 +17,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.method.viewing.camera_paths import fixed, focus, resized
 from spike4dgs.method.viewing.content import Content, free_camera, matching, padded
-from spike4dgs.method.viewing.serving import free_port, own_origins
+from spike4dgs.method.viewing.serving import free_port, own_origins, url_of
 
 FREE = "free"
 LOOP_S = 4.0  # duration of the clip when it plays
@@ -68,7 +68,7 @@ class Viewer:
         self._shown_at = 0.0
         with own_origins(host):
             self.server = need_viser().ViserServer(host, free_port(host, port), label="Spike4DGS", verbose=False)
-        self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
+        self.url = url_of(host, self.server.get_port())
         about, gui = content.saved.provenance, self.server.gui
         gui.add_markdown(f"**{about.name}** on {about.scene}")
         tick_us = 1e6 / about.rate_hz

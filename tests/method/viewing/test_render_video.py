@@ -18,7 +18,7 @@ from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.cli import main
 from spike4dgs.method.viewing.camera_paths import PathName, fixed, focus, make_path, orbit, resized, rig
-from spike4dgs.method.viewing.render_video import frame_times
+from spike4dgs.method.viewing.render_video import frame_times, png_writer
 
 S = np.linspace(0, 1, 33)
 UP = np.array([0.0, 0.0, 1.0])
@@ -34,6 +34,26 @@ def test_the_focus_is_the_target_of_the_cameras_or_in_front_of_parallel_ones() -
     np.testing.assert_allclose(focus(WORLD.cameras), [0.0, 0.3, 0.7], atol=1e-9)
     np.testing.assert_allclose(focus(parallel()), [0.2, 1.0, 0.0], atol=1e-9)  # five radii of 0.2 m
     np.testing.assert_allclose(focus(parallel(1)), [0.0, 5.0, 0.0], atol=1e-9)
+
+
+def around(n: int) -> tuple[Camera, ...]:
+    """Return cameras on a circle of 2 m around a point, which all face it from a little above."""
+    angles = np.arange(n) * 2 * np.pi / n
+    at = [np.array([2 * np.cos(a), 2 * np.sin(a), 0.6]) for a in angles]
+    aims = {"target": np.array([0.0, 0.0, 0.5]), "up": UP, "focal": 30, "width": 40, "height": 24}
+    return tuple(look_at(f"c{i}", center, **aims) for i, center in enumerate(at))
+
+
+def test_cameras_whose_axes_cancel_have_the_middle_ones_orbit() -> None:
+    for n in (3, 6):
+        np.testing.assert_allclose(focus(around(n)), [0, 0, 0.5], atol=1e-9)
+        path = orbit(around(n))
+        for s in S:
+            assert path(s).R[1] @ UP < -0.9 and path(s).R[2] @ (focus(around(n)) - path(s).center) > 1.9
+    a, b = parallel(2)
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    path = orbit((a, replace(b, R=half_turn @ b.R, t=half_turn @ b.t)))
+    assert all(path(s).R[1] @ UP < -0.9 for s in S), "the image is upright as the first camera's"
 
 
 @pytest.mark.parametrize("cameras", [WORLD.cameras, parallel(), parallel(1)], ids=["grid", "row", "one"])
@@ -134,6 +154,12 @@ def test_a_video_has_the_frames_of_the_model(saved: Path, tmp_path: Path, path: 
     for image, wanted in zip(found, expected, strict=True):
         assert np.abs(image.astype(int) - wanted).mean() < 6
     assert {p.name for p in tmp_path.iterdir()} == {"m.safetensors", out.name, "frames"}, "nothing half written"
+
+
+@pytest.mark.parametrize(("count", "first"), [(3, "00000.png"), (100_001, "000000.png")])
+def test_frames_sort_by_name(tmp_path: Path, count: int, first: str) -> None:
+    png_writer(tmp_path, count)(np.zeros((2, 2), np.uint8))
+    assert [path.name for path in tmp_path.iterdir()] == [first]
 
 
 def test_colours_survive_the_video(tmp_path: Path) -> None:

@@ -18,11 +18,12 @@ from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.reports.error_map import ERROR_MAX, error_colors
 from spike4dgs.benchmark.scene.images import encode_srgb
+from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
 from spike4dgs.method.models.saved_model import SavedModel
 from spike4dgs.method.viewing.camera_paths import fixed
 from spike4dgs.method.viewing.content import BORDER, MODES, Content, free_camera, matching, open_content, padded, window
-from spike4dgs.method.viewing.serving import free_port, is_own
+from spike4dgs.method.viewing.serving import free_port, is_own, url_of
 from spike4dgs.method.viewing.viewer import FREE, Viewer
 
 TRAINED = WORLD.training.cameras
@@ -69,7 +70,7 @@ def test_windows_stay_whole_at_the_ends(tick: int, expected: tuple[int, int]) ->
     assert window(tick, 100) == expected and window(tick, 30) == (0, 30)
 
 
-def test_another_scene_is_refused(small_scene: Path) -> None:
+def test_another_scene_is_refused(small_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     about = provenance(scene="pattern-0")
     with pytest.raises(UserError, match="expected toy, which the model was fitted to, found pattern-0"):
         open_content(SavedModel(model("static"), provenance()), small_scene)
@@ -77,6 +78,10 @@ def test_another_scene_is_refused(small_scene: Path) -> None:
         open_content(SavedModel(model("static"), about), small_scene)
     fitting = provenance(scene="pattern-0", n_ticks=80, cameras=array_cameras()[:3])
     opened = open_content(SavedModel(model("static"), fitting), small_scene)
+    assert "the model was fitted to revision 0000000000000000" in capsys.readouterr().out
+    same = replace(fitting, scene_revision=open_scene(small_scene).revision)
+    open_content(SavedModel(model("static"), same), small_scene)
+    assert not capsys.readouterr().out
     assert opened.scene is not None and opened.image("spike rate", opened.scene.cameras[2], 1e9).shape == (24, 40, 3)
 
 
@@ -148,10 +153,21 @@ def test_a_port_that_is_taken_is_passed_over() -> None:
         ("127.0.0.1", "http://a.example:8080", "a.example:8080", False),  # a name that points at this machine
         ("0.0.0.0", "http://lab:8080", "lab:8080", True),
         ("0.0.0.0", "https://a.example", "lab:8080", False),
+        ("127.0.0.1", "http://localhost:8080", "LOCALHOST:8080", True),
+        ("::1", "http://[::1]:8080", "[::1]:8080", True),
+        ("127.0.0.1", None, "[::1", False),  # half an address
+        ("0.0.0.0", "http://[", "lab:8080", False),
     ],
 )
 def test_whose_pages_are_the_viewers_own(host: str, origin: str | None, asked: str, own: bool) -> None:
     assert is_own(origin, asked, host) == own
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"), [("127.0.0.1", "localhost"), ("::", "localhost"), ("::1", "[::1]"), ("lab", "lab")]
+)
+def test_the_address_that_is_printed(host: str, expected: str) -> None:
+    assert url_of(host, 8080) == f"http://{expected}:8080"
 
 
 def test_a_page_of_another_origin_gets_no_socket(viewer: Viewer) -> None:
