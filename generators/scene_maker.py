@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -21,7 +22,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs import generators
 from spike4dgs.benchmark.environment import installed_version
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, read_json, remove_parts, sha256_json, write_json, writing
@@ -285,7 +285,7 @@ def work_key(settings: dict[str, Any], versions: dict[str, str]) -> str:
 
 @cache
 def _sources() -> str:
-    return sources_sha256([generators])
+    return sources_sha256([sys.modules[__name__.rpartition(".")[0]]])
 
 
 @contextmanager
