@@ -14,7 +14,7 @@ Memory grows as pixels x Gaussians. Not differentiated: the visibility decisions
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,7 +23,6 @@ from spike4dgs.method.splat.lens import FRUSTUM_MARGIN, bent, bent_slopes
 from spike4dgs.method.splat.types import (
     ALPHA_MAX,
     ALPHA_MIN,
-    CUSTOMARY,
     NEAR,
     T_MIN,
     PixelFilter,
@@ -94,18 +93,16 @@ def project(
     xx, xy, yy = cov[:, 0, 0] + eps2d, cov[:, 0, 1], cov[:, 1, 1] + eps2d
     det = det_sharp + eps2d * (cov[:, 0, 0] + cov[:, 1, 1]) + eps2d**2
     opacity = splats.opacities[index]
-    keep = (opacity >= ALPHA_MIN) & (det > 0) & shown
-    if antialiased:
-        keep &= opacity * (det_sharp / det).detach().sqrt() >= ALPHA_MIN
-    reach = 2 * (255 * opacity.detach() * ((det_sharp / det).detach().sqrt() if antialiased else 1)).clamp(min=1).log()
+    share = (det_sharp / det).detach().sqrt() if antialiased else torch.ones_like(det)  # that a compensation leaves
+    keep = (opacity >= ALPHA_MIN) & (opacity * share >= ALPHA_MIN) & (det > 0) & shown
+    reach = 2 * (255 * opacity.detach() * share).clamp(min=1).log()
     extent = (reach[:, None] * torch.stack([xx, yy], -1).detach()).sqrt()  # [M, 2] half sides of the visible box
     first = torch.ceil(center.detach() - extent - 0.5).clamp(min=0)
     last = torch.minimum(torch.floor(center.detach() + extent - 0.5), image - 1)
     keep = torch.nonzero(keep & (first <= last).all(-1))[:, 0]
+    opacity = opacity.index_select(0, keep)
     if antialiased:  # after the selection: the root's slope is infinite at 0
-        opacity = opacity.index_select(0, keep) * (det_sharp[keep] / det[keep]).sqrt()
-    else:
-        opacity = opacity[keep]
+        opacity = opacity * (det_sharp[keep] / det[keep]).sqrt()
     cov3 = torch.stack([xx, xy, yy], -1)[keep]
     return Projection(index[keep], center[keep], cov3, det[keep], opacity, p[keep, 2], extent[keep].amax(-1))
 
@@ -143,21 +140,6 @@ def composite(view: Projection, center: Tensor, colors: Tensor, size: tuple[int,
     return image.reshape(size[1], size[0], -1), opaque.reshape(size[1], size[0])
 
 
-def composite_patch(
-    view: Projection, colors: Tensor, corner: tuple[int, int], size: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    """Return image [h, w, F] and alpha [h, w] of the part of a view that has `size` (width, height) px from `corner`.
-
-    Gaussians that cannot reach the part are left out, so that memory grows with the part and not with the image.
-    `colors` are those of all N Gaussians.
-    """
-    offset = torch.tensor(corner, dtype=torch.float64)
-    half = torch.tensor(size, dtype=torch.float64) / 2
-    near = ((view.center - offset - half).abs() <= half + view.radius[:, None]).all(-1)
-    part = Projection(*(getattr(view, f.name)[near] for f in fields(view)))
-    return composite(part, part.center - offset, colors[part.index], size)
-
-
 def render_reference(splats: Splats, views: Views, pixel_filter: PixelFilter, depth: bool) -> RenderOutput:
     """Render with the back end "reference": see `render`. Computes in float64, returns the dtype of the colours."""
     require_finite(splats)
@@ -179,25 +161,3 @@ def render_reference(splats: Splats, views: Views, pixel_filter: PixelFilter, de
     stack = torch.stack(images).to(dtype)
     far = stack[..., -1] if depth else None
     return RenderOutput(stack[..., :-1], torch.stack(opaque).to(dtype), far, radii, means2d)
-
-
-@torch.no_grad()
-def cutoff_margin(splats: Splats, views: Views, pixel_filter: PixelFilter = CUSTOMARY) -> Tensor:
-    """Return each pixel's distance from a decision that float32 may take otherwise, [C, H, W] float64.
-
-    The smallest relative distance, over the Gaussians that reach the pixel, of alpha from 1/255 and of the next T
-    from 1e-4. Where it is below the precision of a back end, a whole Gaussian may be there or not.
-    """
-    size = (views.width, views.height)
-    wide = Splats(*(t.double() for t in splats.tensors))
-    out = torch.full((len(views), views.height, views.width), torch.inf, dtype=torch.float64)
-    for c in range(len(views)):
-        s = project_view(wide, views, c, pixel_filter)
-        if not len(s.index):
-            continue
-        raw, live = alphas(s, s.center, size)
-        after = torch.cumprod(torch.where(raw >= ALPHA_MIN, 1 - raw.clamp(max=ALPHA_MAX), 1.0), 0)
-        reached = torch.cat([torch.ones_like(live[:1]), after[:-1] > T_MIN / 2])
-        gaps = torch.minimum((raw / ALPHA_MIN - 1).abs(), (after / T_MIN - 1).abs())
-        out[c] = torch.where(reached, gaps, torch.inf).amin(0).reshape(views.height, views.width)
-    return out

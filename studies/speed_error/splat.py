@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 from functools import partial
 
 import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.method.splat import Splats, Views, render
-from spike4dgs.method.splat.reference import composite_patch, cutoff_margin, project
-from spike4dgs.method.splat.types import CUSTOMARY
+from spike4dgs.method.splat import PixelFilter, Splats, Views, render
+from spike4dgs.method.splat.reference import Projection, alphas, composite, project, project_view
+from spike4dgs.method.splat.types import ALPHA_MAX, ALPHA_MIN, CUSTOMARY, T_MIN
 from spike4dgs.method.torch_state import one_torch_thread
 from spike4dgs.studies.kit.measurement import TIMES, Column, Point, Request, Series, compared, max_rms, measurement
 from spike4dgs.studies.kit.timing import by_turns_ms
@@ -24,6 +25,43 @@ RMS = Column("rms", "RMS error, radiance")
 SURE = Column("sure", "largest error away from the cut, radiance")
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 _CLEAR = 1e-3  # relative distance from a decision, alpha >= 1/255 or T > 1e-4, that float32 takes as float64 does
+
+
+def composite_patch(
+    view: Projection, colors: Tensor, corner: tuple[int, int], size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Return image [h, w, F] and alpha [h, w] of the part of a view that has `size` (width, height) px from `corner`.
+
+    Gaussians that cannot reach the part are left out, so that memory grows with the part and not with the image.
+    `colors` are those of all N Gaussians.
+    """
+    offset = torch.tensor(corner, dtype=torch.float64)
+    half = torch.tensor(size, dtype=torch.float64) / 2
+    near = ((view.center - offset - half).abs() <= half + view.radius[:, None]).all(-1)
+    part = Projection(*(getattr(view, f.name)[near] for f in fields(view)))
+    return composite(part, part.center - offset, colors[part.index], size)
+
+
+@torch.no_grad()
+def cutoff_margin(splats: Splats, views: Views, pixel_filter: PixelFilter = CUSTOMARY) -> Tensor:
+    """Return each pixel's distance from a decision that float32 may take otherwise, [C, H, W] float64.
+
+    The smallest relative distance, over the Gaussians that reach the pixel, of alpha from 1/255 and of the next T
+    from 1e-4. Where it is below the precision of a back end, a whole Gaussian may be there or not.
+    """
+    size = (views.width, views.height)
+    wide = Splats(*(t.double() for t in splats.tensors))
+    out = torch.full((len(views), views.height, views.width), torch.inf, dtype=torch.float64)
+    for c in range(len(views)):
+        s = project_view(wide, views, c, pixel_filter)
+        if not len(s.index):
+            continue
+        raw, live = alphas(s, s.center, size)
+        after = torch.cumprod(torch.where(raw >= ALPHA_MIN, 1 - raw.clamp(max=ALPHA_MAX), 1.0), 0)
+        reached = torch.cat([torch.ones_like(live[:1]), after[:-1] > T_MIN / 2])
+        gaps = torch.minimum((raw / ALPHA_MIN - 1).abs(), (after / T_MIN - 1).abs())
+        out[c] = torch.where(reached, gaps, torch.inf).amin(0).reshape(views.height, views.width)
+    return out
 
 
 @torch.no_grad()

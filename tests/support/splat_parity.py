@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.method.splat import PixelFilter, RenderOutput, Splats, Views, render
-from spike4dgs.method.splat.reference import cutoff_margin
+from spike4dgs.studies.speed_error.splat import cutoff_margin
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "w2c", "means2d")
 ON_CUTOFF = 1e-4  # relative distance to alpha = 1/255 or T = 1e-4 within which float32 may decide otherwise
