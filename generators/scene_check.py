@@ -23,36 +23,32 @@ from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.generators.profiles import Job
-from spike4dgs.generators.scene_differences import (
-    MOST_PIXELS,
-    Difference,
-    difference,
-    differing_facts,
-    images_of,
-    truth_error,
-)
+from spike4dgs.generators.scene_differences import Difference, difference, differing_facts, images_of, truth_error
 
 EQUAL, NOISE, CHANGE = "equal", "rendering noise", "change of the world"
 # The most that a difference may be of that between two noises. Between Mitsuba's variants the measures of a camera were
 # 0.90 to 1.06 times that (car-0-tiny), those of blocks over all cameras 0.80 to 1.59: few blocks are noisy.
-MOST_OF_CAMERA = {"bits": 1.25, "truth_rms": 1.5, "masks": 2.0}
-MOST_OF_BLOCKS = {
+MOST_OF_CAMERA = {"bits": 1.25, "truth_rms": 1.5}
+MOST_OF_ALL = {
     "spikes_block_rms": 1.75,
     "truth_block_rms": 1.75,
     "spikes_block_max": 2.5,
     "truth_block_max": 2.5,
+    "masks": 2.5,
 }
 MEANING = {
     "bits": "spike bits",
     "truth_rms": "truths",
-    "masks": "masks",
     "spikes_block_rms": "spikes per tick in blocks",
     "truth_block_rms": "truths in blocks",
     "spikes_block_max": "spikes per tick in the worst block",
     "truth_block_max": "truths in the worst block",
+    "masks": "masks",
 }
-_NEGLIGIBLE = {"masks": MOST_PIXELS}  # as of geometry: a mask's edges are those of the objects
 _ROUNDING = 1e-6  # of white, or of the bits
+# Masks have specks of changed light that one noise makes and another does not: up to 1.6e-3 of the pixels of a camera
+# of jaywalk-0-tiny, and none in others.
+_NEGLIGIBLE = {"masks": 2e-3}
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,7 @@ def beyond_noise(found: Mapping[str, Difference], noise: Mapping[str, Difference
     for camera in noise:
         lines += _beyond(camera, MOST_OF_CAMERA, _values([found[camera]]), _values([noise[camera]]))
     all_found, all_noise = _values([found[camera] for camera in noise]), _values(list(noise.values()))
-    return lines + _beyond("all cameras", MOST_OF_BLOCKS, all_found, all_noise)
+    return lines + _beyond("all cameras", MOST_OF_ALL, all_found, all_noise)
 
 
 def _values(differences: Sequence[Difference]) -> dict[str, float]:
