@@ -223,9 +223,10 @@ def camera_of(path: str, cameras: Collection[str]) -> str | None:
 
     The folder at the top names a part, and those of COLMAP's model and of the recordings no camera, such as `0`.
     """
-    top, *folders, name = path.split("/") if "/" in path else (path, path)
-    if top == path or top == "sparse":
+    top, _, rest = path.partition("/")
+    if not rest or top == "sparse":
         return None
+    *folders, name = rest.split("/")
     named = [word for word in folders if word in cameras and top != "calibration"]
     named = named or sorted((c for c in cameras if name.startswith(f"{c}.")), key=len)[-1:]  # `cam` begins `cam.1` too
     return named[0] if named else None
