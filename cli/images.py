@@ -12,10 +12,11 @@ from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.streams import DAT_FILE, DatFile, open_streams
 from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.benchmark.spikes.counted_recording import mean_rate
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.spikes.trains import spike_trains, trains_bytes
 from spike4dgs.benchmark.untrusted import MAX_GAIN
-from spike4dgs.cli.options import WHITE, check_names, mean_rate, warn_of_size, white_of
+from spike4dgs.cli.options import WHITE, check_names, warn_of_size, white_of
 from spike4dgs.generators.recorder.resources import free_bytes
 from spike4dgs.method.images.clip_images import ClipImages, clip_video, write_clip_images
 

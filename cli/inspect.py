@@ -20,9 +20,10 @@ from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.spikes.bad_pixels import BadPixels, find_bad
+from spike4dgs.benchmark.spikes.counted_recording import mean_rate
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.cli.options import mean_rate, warn_of_size, white_of
+from spike4dgs.cli.options import warn_of_size, white_of
 from spike4dgs.studies.kit.timing import write_csv
 
 _INTERVAL_TICKS = 2000  # ticks at the clip's start that inter-spike intervals are taken from

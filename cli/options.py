@@ -12,8 +12,6 @@ from tyro.conf import arg
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.counted_recording import total_counts
-from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.image_size import size_doubt
 from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -62,11 +60,6 @@ def warn_of_size(streams: Mapping[str, SpikeStream]) -> None:
     """Print a line for each stream whose given size looks wrong."""
     for doubt in filter(None, map(size_doubt, streams.values())):
         print(f"warning: {doubt}", file=sys.stderr)
-
-
-def mean_rate(stream: SpikeStream) -> Float64:
-    """Return the spikes per tick [H, W] of a stream, over the ticks that it does not lack."""
-    return total_counts(stream) / max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
 
 
 def white_of(rates: Sequence[Float64], streams: Sequence[SpikeStream]) -> float:

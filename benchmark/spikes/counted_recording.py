@@ -16,9 +16,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Int32, Int64, UInt8
+from spike4dgs.benchmark.arrays import Float64, Int32, Int64, UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.spikes.bits import SMALL, in_threads, kernel, rows
+from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.benchmark.untrusted import read_npz
 
@@ -113,6 +114,11 @@ def total_counts(stream: Recording) -> Int64:
         counts += stream.counts(start, min(start + _MOST, stream.n_ticks))
     stream.release()
     return counts
+
+
+def mean_rate(stream: SpikeStream) -> Float64:
+    """Return the spikes per tick [H, W] of a stream, over the ticks that it does not lack."""
+    return total_counts(stream) / max(int(present(stream.gaps, stream.n_ticks).sum()), 1)
 
 
 @kernel

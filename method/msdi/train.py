@@ -103,12 +103,10 @@ class Training:
         total = image_l1 + of_points  # they share no parameters: there is nothing to weigh
         self.adam.zero_grad()
         total.backward()
-        learning_rates, norms = self.settings.learning_rates(self.step), []
+        learning_rates = self.settings.learning_rates(self.step)
         for group in self.adam.groups:
             group.lr = learning_rates[group.name]
-            norms.append(torch.nn.utils.clip_grad_norm_(group.params, 1.0))
-        if all(norm.isfinite() for norm in norms):  # else the step is skipped: one bad sample must not ruin the network
-            self.adam.step()
+        self.adam.step_clipped()
         self.step += 1
         return StepLosses(total.item(), image_l1.item(), of_points.item())
 

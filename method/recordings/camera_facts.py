@@ -17,7 +17,7 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.bad_pixels import BadPixels
-from spike4dgs.benchmark.spikes.counted_recording import total_counts
+from spike4dgs.benchmark.spikes.counted_recording import mean_rate
 from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.starts.clip import SpikeClip
@@ -90,9 +90,8 @@ def camera_facts(
 
 
 def _facts(camera: str, stream: SpikeStream, bad: BadPixels, gain: float) -> CameraFacts:
-    seen = int(present(stream.gaps, stream.n_ticks).sum())
-    rate = total_counts(stream) / max(seen, 1)
+    lost, rate = int((~present(stream.gaps, stream.n_ticks)).sum()), mean_rate(stream)
     low, high = np.percentile(rate, (1, 99))
     dead, hot, flickering = (int(mask.sum()) for mask in bad.kinds.values())
     mean = float(rate.mean())
-    return CameraFacts(camera, stream.n_ticks - seen, mean, float(low), float(high), dead, hot, flickering, gain)
+    return CameraFacts(camera, lost, mean, float(low), float(high), dead, hot, flickering, gain)

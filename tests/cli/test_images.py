@@ -16,11 +16,12 @@ from spike4dgs.benchmark.exchange.dat import import_dat
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.files import read_json
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_png
+from spike4dgs.benchmark.spikes.counted_recording import mean_rate
 from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import open_stream, pack
 from spike4dgs.benchmark.spikes.trains import spike_trains
 from spike4dgs.cli import main
-from spike4dgs.cli.options import mean_rate, white_of
+from spike4dgs.cli.options import white_of
 from spike4dgs.method.images import clip_images
 
 SIZE = ["--width", str(WIDTH), "--height", str(HEIGHT), "--rate-hz", "20000"]

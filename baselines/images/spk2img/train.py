@@ -204,9 +204,7 @@ class Training:
         self.adam.zero_grad()
         loss.backward()
         # One bad patch must not undo a small network: gradients are a tenth of this once it has learned the mean.
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        if norm.isfinite():  # else the step is skipped: one bad sample must not ruin the network
-            self.adam.step()
+        self.adam.step_clipped()
         self.step += 1
         return loss.item()
 

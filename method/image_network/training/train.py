@@ -22,7 +22,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.gaussians.optimizer import Adam
+from spike4dgs.method.gaussians.optimizer import Adam, set_learning_rate
 from spike4dgs.method.image_network.config import MOVING_LOSS, ImageConfig, ImageTraining
 from spike4dgs.method.image_network.network import ImageNetwork, log_mse
 from spike4dgs.method.image_network.training.data import ImageBatch, crop_size, draw
@@ -111,11 +111,8 @@ class ImageNetworkTraining:
         self.adam.zero_grad()
         asked = losses[:1] if self.network.config.without == MOVING_LOSS else losses
         asked.sum().backward()  # type: ignore[no-untyped-call]
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        for group in self.adam.groups:
-            group.lr = self.settings.learning_rate(self.step)
-        if norm.isfinite():  # else the step is skipped: one bad sample must not ruin the network
-            self.adam.step()
+        set_learning_rate(self.adam, self.settings.learning_rate(self.step))
+        self.adam.step_clipped()
         self.step += 1
         with torch.no_grad():
             before = torch.stack([log_mse(channels[:, 0], truth, weight) for weight in weights])

@@ -21,7 +21,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.scene.training_bursts import BurstFile
 from spike4dgs.method.checkpoint import resume_training, save_training
-from spike4dgs.method.gaussians.optimizer import Adam
+from spike4dgs.method.gaussians.optimizer import Adam, set_learning_rate
 from spike4dgs.method.matching.config import MatcherConfig, MatcherTraining
 from spike4dgs.method.matching.network import Matcher
 from spike4dgs.method.matching.training.data import draw
@@ -91,11 +91,8 @@ class MatchTraining:
         losses = match_losses(live, features, batch.views, batch.pairs, self.settings.jitter, generator)
         self.adam.zero_grad()
         losses.total.backward()  # type: ignore[no-untyped-call]
-        norm = torch.nn.utils.clip_grad_norm_(live.parameters(), 1.0)
-        for group in self.adam.groups:
-            group.lr = self.settings.learning_rate(self.step, self.warm_steps)
-        if norm.isfinite():  # else the step is skipped: one bad sample must not ruin the network
-            self.adam.step()
+        set_learning_rate(self.adam, self.settings.learning_rate(self.step, self.warm_steps))
+        self.adam.step_clipped()
         self.step += 1
         share = min(self.settings.average, self.step / (self.step + 9))  # the first steps are soon forgotten
         with torch.no_grad():

@@ -8,7 +8,15 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.method.gaussians.optimizer import Adam, Decay, apply_edit, export_state, import_state, set_learning_rates
+from spike4dgs.method.gaussians.optimizer import (
+    Adam,
+    Decay,
+    apply_edit,
+    export_state,
+    import_state,
+    set_learning_rate,
+    set_learning_rates,
+)
 from spike4dgs.method.gaussians.parameters import MAX_COPIES, Gaussians, densify, from_points, nearest, relocate, share
 
 RATES = {name: Decay(0.01, 0.001) for name in ("means", "log_scales", "quats", "logits", "colors")}
@@ -160,3 +168,25 @@ def test_a_point_is_never_its_own_neighbour_where_points_coincide(copies: int) -
     assert all(len(set(row)) == 6 for row in index.tolist())
     assert (distance[:, : min(copies - 1, 6)] == 0).all()
     assert (index[:, : min(copies - 1, 6)] % 40 == (torch.arange(len(points)) % 40)[:, None]).all()
+
+
+def test_clipped_steps_are_torchs_and_a_gradient_that_is_no_number_moves_nothing():
+    sizes = {"wide": (300, 4), "narrow": (5,)}
+    first = {k: torch.randn(size, generator=torch.Generator().manual_seed(0)) for k, size in sizes.items()}
+    ours, theirs = ({name: p.clone().requires_grad_() for name, p in first.items()} for _ in range(2))
+    adam = Adam({name: [p] for name, p in ours.items()}, (0.9, 0.99))
+    set_learning_rate(adam, 0.1)
+    twins = [torch.optim.Adam([p], 0.1, (0.9, 0.99), 1e-15) for p in theirs.values()]
+    for scale in (1e3, 1e-3, math.inf, 1.0):
+        for leaves in (ours, theirs):
+            for p in leaves.values():
+                p.grad = (scale * p).detach()
+        if scale == math.inf:
+            ours["narrow"].grad = torch.ones_like(ours["narrow"])  # one group is finite: it does not move either
+        adam.step_clipped()
+        for p, twin in zip(theirs.values(), twins, strict=True):
+            torch.nn.utils.clip_grad_norm_([p], 1.0)
+            if math.isfinite(scale):
+                twin.step()
+        for name, p in ours.items():
+            torch.testing.assert_close(p.detach(), theirs[name].detach(), rtol=1e-5, atol=1e-7)
