@@ -99,12 +99,12 @@ class Adam:
                 maximize=False,
             )
 
-    def step_clipped(self, most: float = 1.0) -> None:
-        """Move as `step` does, by gradients whose norm in each group is `most` at most.
+    def step_clipped(self) -> None:
+        """Move as `step` does, by gradients whose norm in each group is 1 at most.
 
         Where a norm is not finite nothing moves: one bad sample must not ruin a network.
         """
-        norms = [torch.nn.utils.clip_grad_norm_(group.params, most) for group in self.groups]
+        norms = [torch.nn.utils.clip_grad_norm_(group.params, 1.0) for group in self.groups]
         if all(norm.isfinite() for norm in norms):
             self.step()
 
