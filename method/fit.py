@@ -202,7 +202,8 @@ class RecipeMethod(Shown):
                 algorithm, settings = self._static(settings)
         else:
             maker = self.maker(settings)
-            light = light_of(scene, algorithm.layers) if maker.knows_light else None
+            in_mean_light = maker.knows_light and not algorithm.calibrated  # spikes have the light that there is
+            light = light_of(scene, algorithm.layers) if in_mean_light else None
 
             def make(maker: ImageMaker, settings: ImageSettings) -> TrainingImages:
                 return make_training_images(scene, start.cameras, maker, settings, request.device, light)

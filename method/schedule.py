@@ -123,7 +123,8 @@ class Stage:
 def stages(settings: TrainerSettings, moves: bool, rests_first: bool = True, pieces: int = 1) -> list[Stage]:
     """Return the static stage, followed by deforming ones where the motion model moves; or one that deforms throughout.
 
-    A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians. `pieces` is odd.
+    A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians. `pieces` is odd. Raises
+    UserError where a background is to be frozen after a static stage that there is not.
     """
     s = settings
     share, middle = s.coarse_share / pieces, pieces // 2
@@ -131,6 +132,9 @@ def stages(settings: TrainerSettings, moves: bool, rests_first: bool = True, pie
     if not moves:
         return [Stage(0, s.coarse_steps, deforms=False)]
     if not rests_first:
+        if s.freeze_background:
+            expected = "trainer.freeze_background false, as the motion has no static stage"
+            raise problem("settings", expected, "true", "leave it out, or choose another motion")
         return [Stage(0, s.coarse_steps + s.fine_steps, deforms=True, begin=center)]
     plan = [Stage(0, s.coarse_steps, deforms=False, span=center, begin=center)]
     for piece in sorted(range(pieces), key=lambda p: abs(p - middle)):

@@ -12,10 +12,9 @@ from torch import Tensor
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.gaussians.parameters import Gaussians
-from spike4dgs.method.models.fitted_model import GaussianModel, count_bytes, light_of_file
+from spike4dgs.method.models.fitted_model import GaussianModel, count_bytes, light_of_file, light_part
 from spike4dgs.method.models.model_file import ModelFile, group, write_model
 from spike4dgs.method.splat import Splats
-from spike4dgs.method.training_views.light_layers import factor_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +123,7 @@ class TrackedModel(GaussianModel):
         means, quats, colors = g.means.clone(), g.quats.clone(), g.colors.clone()
         means[self.tracks.free], quats[self.tracks.free] = values["means"], values["quats"]
         colors[self.tracks.rows] = values["colors"]
-        if self.light is not None:  # at the instant itself: it may flicker faster than the tracks have times
-            colors *= factor_at(self.light.double().cpu().numpy(), t_us / self.duration_us)
+        colors *= self.light_at(t_us)  # of the instant itself: light may flicker faster than the tracks have times
         return replace(g, means=means, quats=quats, colors=colors)
 
     def splats(self, t_us: float) -> Splats:
@@ -136,8 +134,7 @@ class TrackedModel(GaussianModel):
         """Write the model to one file; see `saved_model.load_model`."""
         t = self.tracks
         tracks = {**t.tensors(), "times_us": t.times_us, "free": t.free, "rows": t.rows}
-        light = {} if self.light is None else {"light": {"factors": self.light}}
-        tensors = group(gaussians=self.gaussians.tensors(), tracks=tracks, **light)
+        tensors = group(gaussians=self.gaussians.tensors(), tracks=tracks, **light_part(self.light))
         write_model(path, ModelFile(self.KIND, {}, tensors, provenance))
 
     @classmethod

@@ -164,6 +164,7 @@ class _Download:
                 w.path.unlink(missing_ok=True)
             write_json(started, {"excerpt": excerpt})
         whole = [w for w in wanted if _is_window(w.path, cut[1] - cut[0], hashes)]
+        known = {w.path.stem: hashes[w.path.stem] for w in whole if w.path.stem in hashes}
         for w in whole:
             w.part.unlink(missing_ok=True)
         transfer(self.source, [w for w in wanted if w not in whole], self.progress, self.workers)
@@ -174,7 +175,7 @@ class _Download:
             streams[path.stem] = open_stream(
                 path, *size, scene.rate_hz, rows_bottom_up=order, n_ticks=n_ticks, gaps=gaps, dead_ticks=dead
             )
-        hashes = {camera: sha256_file(root / f"{camera}.dat") for camera in streams}
+        hashes = {camera: known.get(camera) or sha256_file(root / f"{camera}.dat") for camera in streams}
         folder.write_stream_folder(root, streams, {"excerpt": excerpt, "sha256": hashes})
         started.unlink(missing_ok=True)
 

@@ -84,10 +84,17 @@ class GaussianModel(Shown):
     duration_us: float
     device: str
     pixel_filter: PixelFilter = PixelFilter()  # that it was fitted with
+    light: Tensor | None = None  # factors of the light over equal parts of the clip [n]
 
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`."""
         raise NotImplementedError
+
+    def light_at(self, t_us: float) -> float:
+        """Return the light's factor at a time, linear between the middles of the parts of `light`; else 1."""
+        if self.light is None:
+            return 1.0
+        return factor_at(self.light.double().cpu().numpy(), t_us / self.duration_us)
 
     def image(self, image: Tensor, views: Views) -> Tensor:
         """Return gray radiance [V, H, W] of rendered channels [V, H, W, F]."""
@@ -160,7 +167,7 @@ class FittedModel(GaussianModel):
         image = self.image(channels, view)
         if self.light is None:
             return image
-        factor = self._light_at(t_us)
+        factor = self.light_at(t_us)
         return lit(image, channels, factor) if self._layered else image * factor
 
     @property
@@ -168,17 +175,12 @@ class FittedModel(GaussianModel):
         """Whether colours have a layer of a lamp, see `light_layers`."""
         return self.light is not None and self.background.colors.shape[1] == 2
 
-    def _light_at(self, t_us: float) -> float:
-        """Return the factor of the light at a time, linear between the middles of the parts of `light`."""
-        assert self.light is not None
-        return factor_at(self.light.double().cpu().numpy(), t_us / self.duration_us)
-
     def splats(self, t_us: float) -> Splats:
         """Return what is rendered at `t_us`, in the frame of the array; that time's light is in the gray values."""
         splats = self._all(t_us)
         if self.light is None or not (self._layered or splats.colors.shape[1] == 1):
             return splats  # what a network decodes is no gray value: its image is lit
-        factor, colors = self._light_at(t_us), splats.colors
+        factor, colors = self.light_at(t_us), splats.colors
         gray = lit(colors[:, :1], colors[:, None], factor) if self._layered else colors * factor
         return Splats(*splats.geometry, gray)
 
@@ -208,9 +210,8 @@ class FittedModel(GaussianModel):
         """Write the model to one file; see `saved_model.load_model`."""
         pieces = {f"piece{i}": to_file_names(g.tensors()) for i, g in enumerate(self.pieces)}
         background = {BACKGROUND: to_file_names(self.background.tensors())}
-        light = {} if self.light is None else {"light": {"factors": self.light}}
         own = {} if self.path is None else {"path": self.path.tensors()}
-        tensors = group(**pieces, **background, motion=self.motion.state_dict(), **light, **own)
+        tensors = group(**pieces, **background, motion=self.motion.state_dict(), **light_part(self.light), **own)
         config = {"motion": self.spec.as_dict(), "pieces": len(pieces), "filter": asdict(self.pixel_filter)}
         write_model(path, ModelFile(self.KIND, config, tensors, provenance))
 
@@ -237,6 +238,11 @@ class FittedModel(GaussianModel):
         for piece in range(count):  # else what the motion lacks of one would only be missed at a render
             made.splats(duration_us * piece / count)
         return made
+
+
+def light_part(light: Tensor | None) -> dict[str, dict[str, Tensor]]:
+    """Return the part of a model's file that holds the factors [n] of its light, where it has any."""
+    return {} if light is None else {"light": {"factors": light}}
 
 
 def light_of_file(file: ModelFile) -> Tensor | None:

@@ -36,9 +36,10 @@ TRUE = Initialization(lambda r: Start(r.scene.cameras, *WORLD.surfaces(r.scene.c
 PARTS = Parts({"intervals": INTERVALS}, {"true": TRUE}, MOTIONS, SUPERVISIONS)
 
 
-def fitted(apart: bool) -> FittedModel:
-    steps = {"trainer.coarse_steps": 30, "trainer.fine_steps": 70, "trainer.freeze_background": True}
-    method = RecipeMethod(Recipe("test", "intervals", "true", "paths", "pixel", {**QUICK, **steps}), PARTS)
+def fitted(apart: bool, supervision: str = "pixel", steps: int = 100) -> FittedModel:
+    coarse = 3 * steps // 10
+    own = {"trainer.coarse_steps": coarse, "trainer.fine_steps": steps - coarse, "trainer.freeze_background": True}
+    method = RecipeMethod(Recipe("test", "intervals", "true", "paths", supervision, {**QUICK, **own}), PARTS)
     method.algorithm = replace(method.algorithm, layers=apart)
     model = method.fit(WORLD.training, request())
     assert isinstance(model, FittedModel)
@@ -73,3 +74,8 @@ def test_each_gaussian_has_a_share_of_the_lamp_and_splats_are_lit_as_the_render(
     check_splats(own)
     for moving in (False, True):
         assert WORLD.psnr(own, moving) > WORLD.psnr(whole, moving) + 2
+
+
+def test_images_beside_a_loss_of_spikes_have_the_light_of_the_spikes(capsys) -> None:
+    assert fitted(apart=False, supervision="spss", steps=10).light is None
+    assert "light" not in capsys.readouterr().err

@@ -316,6 +316,8 @@ def test_moving_scene_opens_up_from_the_middle_to_the_whole_clip():
     assert min(whole) <= 1 and max(whole) >= 98 and len(whole) > 80
     (throughout,) = stages(s, moves=True, rests_first=False)
     assert throughout.deforms and throughout.steps == 600
+    with pytest.raises(UserError, match="freeze_background false, as the motion has no static stage"):
+        stages(replace(s, freeze_background=True), moves=True, rests_first=False)
     (only,) = stages(s, moves=False)
     assert len({choose_time(s, only, step, 100) for step in range(200)}) > 95
 
