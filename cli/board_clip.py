@@ -1,4 +1,4 @@
-"""`board-clip`: a scene of a chessboard that moves in front of an array, to record and calibrate with."""
+"""`board-clip`: a scene of a chessboard that moves in front of an array, to try recording and calibration."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def board_clip(
 ) -> int:
     """Simulate a chessboard that moves in front of an array of cameras: a scene for `record --emulate`.
 
-    The board is where every camera sees all of it for most of the clip. Where cameras stand far apart it is farther
-    away and larger; its size is printed, for `calibrate-rig --square-m`.
+    The board is placed where every camera sees all of it for most of the clip. If the cameras are far apart, it is
+    farther away and larger. Its size is printed, for `calibrate-rig --square-m`.
 
     Args:
         out: Folder of the scene.
-        seconds: Length of the clip; the board makes the same motion in any length, so a longer clip is slower.
+        seconds: Length of the clip. The board makes the same motion in any length, so it is slower in a longer clip.
         width: Pixels per row of the cameras.
         height: Rows of the cameras.
         columns: Inner corners of the board from left to right.
-        rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
-        square_m: Side of a square in metres; if left out 0.04, or more where the array needs a larger board.
+        rows: Inner corners from top to bottom; one of the two numbers must be odd, the other even.
+        square_m: Side of a square in metres; if left out, 0.04, or more if the array needs a larger board.
         seed: Seed of the array's mounting errors and of the sensors.
         like: A scene folder whose array films the board, instead of nine cameras of --width and --height.
     """

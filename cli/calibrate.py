@@ -21,7 +21,7 @@ from spike4dgs.studies.kit.timing import show_table
 def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) -> int:
     """Estimate gain and dark maps of a scene's cameras from its flat-field and dark recordings: OUT/CAM.npz and .png.
 
-    Where the scene holds the true maps (truth/), the table lists the errors of the estimates.
+    If the scene contains the true maps (truth/), the table lists the errors of the estimates.
 
     Args:
         scene: Scene folder with calibration/flat and calibration/dark.

@@ -53,8 +53,8 @@ def calibrate_rig(
         out: Folder for the results.
         board: The board.
         views: Number of views (windows of ticks), in all clips together.
-        window_ticks: Ticks that an image adds up; more ticks give less noise and more motion blur.
-        freedom: What is unknown.
+        window_ticks: Ticks that are summed into an image; more give less noise and more motion blur.
+        freedom: What is estimated.
         allow_gaps: Use clips with gaps; images with missing ticks are left out.
     """
     if not clips:

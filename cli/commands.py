@@ -26,7 +26,7 @@ GROUPS: dict[str, str] = {
 COMMANDS: dict[str, Command] = {
     "make-dataset": Command(
         "spike4dgs.cli.make_dataset:make_dataset",
-        "render a world and simulate its spike cameras",
+        "render worlds and simulate their spike cameras",
         "make-dataset --all --profile small --out data",
         seed_bits=128,  # those of a season
     ),
@@ -37,7 +37,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "calibrate": Command(
         "spike4dgs.cli.calibrate:calibrate",
-        "estimate gain and dark maps from flat-field and dark recordings",
+        "estimate gain and dark maps from the flat-field and dark recordings",
         "calibrate data/car-0-small",
     ),
     "record": Command(
@@ -47,7 +47,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "board-clip": Command(
         "spike4dgs.cli.board_clip:board_clip",
-        "simulate a chessboard that moves in front of an array, to record and calibrate with",
+        "simulate a moving chessboard in front of an array, to try record and calibrate-rig",
         "board-clip --out runs/board --seconds 1",
     ),
     "calibrate-rig": Command(
@@ -57,12 +57,12 @@ COMMANDS: dict[str, Command] = {
     ),
     "train-spk2img": Command(
         "spike4dgs.cli.train_spk2img:train_spk2img",
-        "train the network of the spk2img images on training variants of the worlds",
+        "train Spk2ImgNet on training variants of the worlds",
         "train-spk2img --scenes data/car-1-small data/bricks-1-small --hidden data/bricks-2-small --out runs/spk2img",
     ),
     "make-msdi-data": Command(
         "spike4dgs.cli.make_msdi_data:make_msdi_data",
-        "render training data of MSDI: many variants of the worlds, seen by many rigs",
+        "render training data for MSDI: many variants of the worlds, seen by many rigs",
         "make-msdi-data --variants 40 --out data/msdi",
     ),
     "train-msdi": Command(
@@ -72,32 +72,32 @@ COMMANDS: dict[str, Command] = {
     ),
     "run-benchmark": Command(
         "spike4dgs.cli.run_benchmark:run_benchmark",
-        "fit methods on scenes, score them, enter them into a leaderboard",
+        "fit methods on scenes, score them, and enter them into a leaderboard",
         "run-benchmark data/car-0-small data/turntable-0-small --methods tfp+4dgs --out runs/small --seed 0",
     ),
     "methods": Command(
         "spike4dgs.cli.methods:methods",
-        "list the installed methods: parts, package, description",
+        "list the installed methods with their parts, or describe one with its settings",
         "methods",
     ),
     "fit": Command(
         "spike4dgs.cli.fit:fit",
-        "fit a model to a recording without ground truth; write a video and a report",
+        "fit a model to a recording without ground truth; write a sheet, a video and a report",
         "fit captures/turntable --out runs/turntable",
     ),
     "fault-table": Command(
         "spike4dgs.cli.studies:fault_table",
-        "make captures of a scene worse on purpose, fit them, and tabulate the dB lost",
+        "degrade captures of a scene on purpose, fit them, and tabulate the dB lost",
         "fault-table data/turntable-0-small --out runs/faults",
     ),
     "score": Command(
         "spike4dgs.cli.score:score",
-        "score a predictions folder of any program",
+        "score a predictions folder from any program",
         "score runs/small/predictions/tfp+4dgs data/car-0-small data/turntable-0-small --out r.json",
     ),
     "submit": Command(
         "spike4dgs.cli.submit:submit",
-        "verify a result record and enter it into the leaderboard",
+        "verify a result record and enter it into a leaderboard",
         "submit r.json --predictions runs/small/predictions/tfp+4dgs --scenes data/car-0-small data/turntable-0-small",
     ),
     "verify-leaderboard": Command(
@@ -106,19 +106,21 @@ COMMANDS: dict[str, Command] = {
         "verify-leaderboard leaderboard",
     ),
     "leaderboard": Command(
-        "spike4dgs.cli.leaderboard:show", "print the ranking, with intervals of the ranks", "leaderboard"
+        "spike4dgs.cli.leaderboard:show", "print the ranking of the tracks, with rank intervals and ties", "leaderboard"
     ),
     "leaderboard build": Command(
-        "spike4dgs.cli.leaderboard:build", "write the leaderboard as a page", "leaderboard build"
+        "spike4dgs.cli.leaderboard:build",
+        "write the leaderboard as a page of files, with your runs among the entries",
+        "leaderboard build",
     ),
     "season make": Command(
         "spike4dgs.cli.season:make",
-        "draw secret seeds, make hidden scenes, write the commitments to them",
+        "draw secret seeds, make hidden scenes, and write the commitments to them",
         "season make 1 --worlds car turntable --secret ~/season-1",
     ),
     "season publish": Command(
         "spike4dgs.cli.season:publish",
-        "write what may be public by now as tars: training parts, in the end whole scenes",
+        "write tars of what may be public so far: training parts, and whole scenes after the reveal",
         "season publish 1 --secret ~/season-1 --out public",
     ),
     "season predict": Command(
@@ -128,7 +130,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "season score": Command(
         "spike4dgs.cli.season:score",
-        "score submitted predictions, or methods that are run first",
+        "score submitted predictions, or run methods and score them",
         "season score 1 --secret ~/season-1 --predictions received/theirs --methods tfp+4dgs",
     ),
     "season reveal": Command(
@@ -162,7 +164,7 @@ COMMANDS: dict[str, Command] = {
         "view runs/small/models/tfp+4dgs/car-0-small.safetensors --scene data/car-0-small",
     ),
     "doctor": Command(
-        "spike4dgs.cli.doctor:doctor", "say what this machine has, what it lacks, and what mends it", "doctor"
+        "spike4dgs.cli.doctor:doctor", "report what this machine has, what it lacks, and how to fix it", "doctor"
     ),
     "download": Command(
         "spike4dgs.cli.download:download",
@@ -171,7 +173,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "download weights": Command(
         "spike4dgs.cli.download_weights:download_weights",
-        "fetch weight files of metrics and methods, their licences shown first",
+        "fetch weight files for metrics and methods, their licences shown first",
         "download weights lpips",
     ),
     "release pack": Command(
@@ -181,22 +183,22 @@ COMMANDS: dict[str, Command] = {
     ),
     "release check": Command(
         "spike4dgs.cli.release:check",
-        "check a release: a host's limits, its index, every byte",
+        "check a release: a host's limits, the index, every byte",
         "release check releases/2",
     ),
     "release publish": Command(
         "spike4dgs.cli.release:publish",
-        "upload a release to Zenodo, Hugging Face or a web server; with --dry-run show what would be sent",
+        "upload a release to Zenodo, Hugging Face or a web server; --dry-run shows what would be sent",
         "release publish releases/2-flat --to zenodo-sandbox --dry-run",
     ),
     "release wheel": Command(
         "spike4dgs.cli.release:wheel",
-        "write a wheel of a small release, by which pip brings its scenes",
+        "write a wheel of a small release, so that pip can install its scenes",
         "release wheel releases/quick-start --out dist",
     ),
     "release fingerprint": Command(
         "spike4dgs.cli.release:fingerprint",
-        "write small files by which scenes made on other processors are recognised",
+        "write small files that identify scenes made on other processors",
         "release fingerprint data/car-0-small --out leaderboard/releases/2",
     ),
     "verify": Command(
@@ -206,12 +208,12 @@ COMMANDS: dict[str, Command] = {
     ),
     "import-dat": Command(
         "spike4dgs.cli.import_dat:import_dat",
-        "make a folder of streams or a scene from bare .dat files, with cameras of COLMAP, OpenCV or Kalibr",
+        "make a folder of streams or a scene from bare .dat files, with cameras from COLMAP, OpenCV or Kalibr",
         "import-dat recordings --width 400 --height 250 --rate-hz 20000 --cameras camchain.yaml --out data/first",
     ),
     "import-frames": Command(
         "spike4dgs.cli.import_frames:import_frames",
-        "make a scene of what an array of ordinary cameras filmed, each instant held still",
+        "make a scene from the footage of an array of ordinary cameras, with each instant held still",
         "import-frames footage --cameras cameras.yml --held-out cam_1 --width 240 --out data/first",
     ),
     "import-spikecv": Command(
@@ -230,21 +232,23 @@ COMMANDS: dict[str, Command] = {
         "poses data/car-0-small data/bricks-0-small --initialization colmap",
     ),
     "patterns": Command(
-        "spike4dgs.cli.studies:patterns", "find fixed patterns in the clip", "patterns data/car-0-small"
+        "spike4dgs.cli.studies:patterns",
+        "estimate the cameras' gain and dark maps from the clip alone, and measure their errors",
+        "patterns data/car-0-small",
     ),
     "export-nerfstudio": Command(
         "spike4dgs.cli.export_nerfstudio:export_nerfstudio",
-        "write a scene as nerfstudio's D-NeRF data: images, poses, times",
+        "write images, poses and times for nerfstudio's parsers and nerfbaselines",
         "export-nerfstudio data/car-0-small --out car-nerfstudio",
     ),
     "export-colmap": Command(
         "spike4dgs.cli.export_colmap:export_colmap",
-        "write images from a scene's spikes with a COLMAP model beside them",
+        "write images from a scene's spikes with a COLMAP model",
         "export-colmap data/car-0-small --out car-colmap",
     ),
     "export-ply": Command(
         "spike4dgs.cli.export_ply:export_ply",
-        "write the Gaussians of a fitted model at several times as .ply files",
+        "write a model's Gaussians at several times as .ply files for other viewers",
         "export-ply runs/small/models/tfp+4dgs/car-0-small.safetensors --times 30 --out car-ply",
     ),
     **MEASUREMENTS,

@@ -16,7 +16,7 @@ Shell = Literal["bash", "zsh", "fish"]
 
 
 def completion(shell: Positional[Shell]) -> int:
-    """Print a shell's completion script. It is made from all commands, which takes some seconds: keep it in a file.
+    """Print a shell's completion script. This takes several seconds, so save the script to a file.
 
     bash: `spike4dgs completion bash > ~/.local/share/bash-completion/completions/spike4dgs`.
     zsh: `spike4dgs completion zsh > ~/.zfunc/_spike4dgs`, with `fpath+=~/.zfunc` before `compinit` in ~/.zshrc.

@@ -33,8 +33,8 @@ def load(name: str) -> Callable[..., Any]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
-    0: done; 1: a benchmark ran and something in it failed; 2: bad arguments or input; 3: a recording lost data;
-    130: interrupted; 141: who read the output went away, as after `| head`.
+    0: done; 1: the command ran, but something in it failed; 2: bad arguments or input, or damage found; 3: a recording
+    lost data; 130: interrupted; 141: the reader of the output closed it, as `| head` does.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:

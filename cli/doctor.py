@@ -1,4 +1,4 @@
-"""`doctor`: what this machine has for the benchmark, what it lacks, and the line that mends each."""
+"""`doctor`: what this machine has for the benchmark, what it lacks, and the line that fixes each."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ METRIC_WEIGHTS = (("LPIPS alex", ALEXNET), ("LPIPS vgg", VGG16), ("LPIPS squeeze
 
 @dataclass(frozen=True)
 class Finding:
-    """A part of the machine, its state, what was found, and the line that mends it."""
+    """A part of the machine, its state, what was found, and the line that fixes it."""
 
     part: str
     state: str
@@ -52,14 +52,14 @@ Check = Callable[[], Iterator[Finding]]
 
 
 def doctor(*, gpu_receipt: Path | None = None) -> int:
-    """Say what this machine has, what it lacks, and what mends it. Nothing is installed or changed.
+    """Report what this machine has, what it lacks, and how to fix it. Nothing is installed or changed.
 
-    The exit code is 1 where something that every run needs is broken, and 0 otherwise.
+    The exit code is 1 if something that every run needs is broken, and 0 otherwise.
 
     Args:
-        gpu_receipt: Instead run the tests of the GPU and a timing, some minutes, and write both to this JSON file, for
-            you to send. It names the card and the versions of libraries, and no user, host or folder. Needs a checkout
-            with the extra `test`. The exit code is 1 if a test failed.
+        gpu_receipt: Instead, run the GPU tests and a timing, which takes some minutes, and write both to this JSON
+            file, for you to send. It names the card and the library versions, but no user, host or folder. This needs
+            a checkout with the extra `test`. The exit code is 1 if a test failed.
     """
     if gpu_receipt is not None:
         from spike4dgs.studies.gpu_receipt.command import gpu_receipt as make
@@ -244,7 +244,7 @@ NETWORKS: dict[str, Callable[[], Path]] = {name: partial(_weights, name) for nam
 
 
 def _print(console: Console, finding: Finding, indent: int) -> None:
-    """Print a finding, and the line that mends it unbroken, so that it can be copied."""
+    """Print a finding, and the line that fixes it unbroken, so that it can be copied."""
     lines = textwrap.wrap(finding.found, console.width - indent - 10) or [""]
     line = Text(f"{finding.part:<{indent}}")
     line.append(f"{finding.state:<9}", _STYLES[finding.state])

@@ -27,18 +27,18 @@ def download(
     sha256: str | None = None,
     workers: int = WORKERS,
 ) -> int:
-    """Fetch scenes of a release; every byte is verified as it arrives. A killed download goes on where it was.
+    """Fetch scenes of a release; every byte is verified as it arrives. A killed download resumes where it stopped.
 
     Without --scenes, --cameras, --parts or --window-ms, whole scenes are fetched. `download weights` fetches
     weight files.
 
     Args:
-        track: A track such as ideal, whose revisions the release must have; or all scenes of the release.
-        source: Where the release lies: https://..., hf://datasets/OWNER/NAME, s3://..., file://... or a path;
+        track: A track such as ideal, whose revisions the release must have, or `all` for all scenes of the release.
+        source: Where the release is: https://..., hf://datasets/OWNER/NAME, s3://..., file://... or a path;
             SPIKE4DGS_RELEASE if left out.
         out: Folder for the scenes.
         sha256: The SHA-256 of release.json, which pins every byte of the release.
-        workers: Requests at the same time.
+        workers: Number of simultaneous requests.
     """
     if workers < 1:
         raise problem("--workers", "at least 1", str(workers), "correct the number")

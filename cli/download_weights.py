@@ -21,13 +21,13 @@ FILES = {"lpips": ALEXNET, **OTHERS, **PUBLISHED}
 
 
 def download_weights(names: Positional[tuple[str, ...]] = (), *, source: From = None, yes: bool = False) -> int:
-    """Fetch weight files after their licences were accepted. Where a hash is known, it is checked.
+    """Fetch weight files once you have accepted their licences. Known hashes are checked.
 
-    Files go where metrics and methods look for them: the folder that SPIKE4DGS_WEIGHTS names, else torch hub's.
+    Files go where metrics and methods look for them: the folder that SPIKE4DGS_WEIGHTS names, or else torch hub's.
 
     Args:
-        names: lpips (AlexNet, of the tables), lpips-vgg, lpips-squeeze, metaiqa, dust3r, ssml, ssir, spikeclip,
-            scflow; a list of all if left out.
+        names: lpips (AlexNet, used in the tables), lpips-vgg, lpips-squeeze, metaiqa, dust3r, ssml, ssir, spikeclip,
+            scflow; if left out, all are listed.
         source: Another folder to fetch the files from, such as a mirror: https://..., file://... or a path.
         yes: Accept the licences without being asked.
     """

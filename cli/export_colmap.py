@@ -1,10 +1,10 @@
-"""`export-colmap`: images from spikes with a COLMAP model beside them.
+"""`export-colmap`: images from spikes with a COLMAP model.
 
     OUT/images/CAMERA/TICK.png
     OUT/sparse/0/cameras.bin, images.bin, points3D.bin, ...
 
-Images are called `CAMERA/TICK.png` in the model. All images of a camera share its camera, PINHOLE or with lens
-distortion OPENCV, and its pose. Images are as the camera sees them, not undistorted.
+In the model, images are called `CAMERA/TICK.png`. All images of a camera share one camera and one pose. The camera is a
+PINHOLE; with lens distortion it is an OPENCV camera (FULL_OPENCV if k3 is not 0), and images are not undistorted.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ def export_colmap(
 ) -> int:
     """Write images of the training cameras, made from their spikes, with a COLMAP model of their poses.
 
-    COLMAP and programs that read its models open OUT with images/ and sparse/0. The model has no points: COLMAP's
+    COLMAP and programs that read its models can open OUT, with images/ and sparse/0. The model has no points; COLMAP's
     `point_triangulator` finds some. Images are 8-bit sRGB, clipped at white. Held-out cameras, ground truth and
-    calibration recordings stay behind.
+    calibration recordings are left out.
 
     Args:
         scene: Scene folder.
         out: New folder to write.
         images: The image maker, such as tfp or tfi.
-        ticks: Ticks of the images; give these, or --every.
+        ticks: Ticks of the images; give these or --every.
         every: Ticks from one image of a camera to the next; 20 if neither is given.
         split: Training cameras; the scene's default split if left out.
         allow_gaps: Accept a recording with gaps. Images at missing ticks are left out.

@@ -7,9 +7,9 @@
 Each transforms_*.json has one `camera_angle_x`, `w`, `h` and frames of `file_path` (without suffix), `time` and
 `transform_matrix` (camera to world, OpenGL axes). Many programs for dynamic scenes read the same layout.
 
-Some of them take images for square, and put the principal point of a wide one too low. transforms.json has all images
-with intrinsics for each (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`), and lists the parts (`train_filenames`, ...): the other
-parser of nerfstudio and nerfbaselines load it.
+Some of them assume square images, and put the principal point of a wide image too low. transforms.json lists all images
+with intrinsics for each (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`), and the parts (`train_filenames`, ...). nerfstudio's
+other parser and nerfbaselines load it.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ def export_nerfstudio(
 ) -> int:
     """Write a scene as data for nerfstudio's D-NeRF parser (and others that read this layout).
 
-    Training images are made from the spikes of the training cameras; validation images too, at times between;
-    test images are the ground truth of the held-out cameras. Lossy: 8-bit sRGB images clipped at white, one per
-    window of spikes instead of the stream; one focal length, and the principal point in the middle (other cameras are
-    refused); masks, geometry, calibration and points stay behind. To compare methods, score a predictions folder here.
+    Training images (and validation images, at times between) are made from the spikes of the training cameras; test
+    images are the ground truth of the held-out cameras. The export is lossy: images are 8-bit sRGB, clipped at white,
+    one per window of spikes instead of the stream. All cameras must share one focal length and have the principal point
+    in the middle. Masks, geometry, calibration and points are left out. To compare methods, score a predictions folder.
 
     Args:
         scene: Scene folder.
@@ -67,8 +67,8 @@ def export_nerfstudio(
         images: The image maker for training and validation images, such as tfp or tfi.
         every: Ticks from one training image of a camera to the next; 2 or more.
         split: Training and held-out cameras; the scene's default split if left out.
-        colour: Test images in colour, where the ground truth has it. Spike cameras, and so the training images,
-            see gray: compare with test images in gray.
+        colour: Write test images in colour, if the ground truth has it. Spike cameras see gray, so training images
+            are gray: compare with gray test images.
         allow_gaps: Accept a recording with gaps. Images at missing ticks are left out.
     """
     opened = open_scene(scene, allow_gaps, split)

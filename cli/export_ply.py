@@ -12,15 +12,15 @@ from spike4dgs.method.viewing.ply import write_ply
 def export_ply(model: Positional[Path], out: Path, *, times: int = 30, device: str = "cpu") -> int:
     """Write the Gaussians of a fitted model at equally spaced times as .ply files, which splat viewers open.
 
-    A file is named by its tick. Colour is the sRGB-encoded gray radiance at degree 0 of the spherical harmonics. Of a
-    model fitted with another pixel filter than viewers' 0.3 px^2, opacities are scaled so that its light stays.
-    Gaussians that have faded away at a time are left out of its file. Radiance fields have no Gaussians, and colours
-    that a network decodes (the motion `spacetime`) have no place in a .ply: both are refused.
+    Each file is named by its tick. Colour is the sRGB-encoded gray radiance, as degree 0 of the spherical harmonics. If
+    the model was fitted with another pixel filter than viewers' 0.3 px^2, opacities are scaled to preserve its light.
+    Gaussians that have faded at a time are left out of its file. Radiance fields have no Gaussians, and a .ply cannot
+    hold colours that a network decodes (the motion `spacetime`), so both are refused.
 
     Args:
-        model: A model that run-benchmark has saved: OUT/models/METHOD/SCENE.safetensors.
+        model: A model saved by run-benchmark: OUT/models/METHOD/SCENE.safetensors.
         out: New folder to write.
-        times: Number of files, in the middles of so many equal parts of the clip.
+        times: Number of files; the clip is divided into as many equal parts, and each file is at the middle of one.
         device: cpu or cuda.
     """
     saved, ticks = write_ply(model, out, times, device)

@@ -1,4 +1,4 @@
-"""`fit`: a model of a recording, with what one wants to see of it."""
+"""`fit`: fit a model to a recording, and write a sheet, a video and a report."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ def fit(
 ) -> int:
     """Fit a model to a recording, and write a sheet, a slow-motion video and a report. No ground truth is needed.
 
-    Missing ticks are filled, bad pixels left out and unequal gains corrected; the report says what was found.
-    A recording without poses (streams of `record` before a calibration) gets estimated ones. A killed fit resumes where
-    it was. Poses and clocks are checked against the clip, and estimated anew where they are wrong. Cameras that the
-    recording holds out are judged by their own spikes: their renders are in OUT/predictions.
+    Missing ticks are filled, bad pixels left out and unequal gains corrected; the report says what was found. If a
+    recording has no poses (streams of `record` before a calibration), they are estimated. Poses and clocks are checked
+    against the clip, and corrected if they are wrong. Held-out cameras are judged by their own spikes; their renders
+    are in OUT/predictions. A killed fit resumes where it stopped.
 
     Args:
-        scene: A scene folder, or a folder of streams that `record` has written.
-        method: Method by name.
+        scene: A scene folder, or a folder of streams from `record` or `import-dat`.
+        method: Name of the method.
         settings: Other settings of the method, such as motion.lr_grid=0.005; see `spike4dgs methods NAME`.
         out: Folder for model.safetensors, sheet.png, video.mp4 and report.html.
         budget: quick, standard (4 times the steps), paper (the publication's steps), or a multiple of quick.
-        poses: auto (given ones are adjusted where features say that they are wrong) or given.
-        clocks: auto (the cameras' clocks are estimated from what moves, and used where they differ) or given.
+        poses: auto (given poses are adjusted if matched features show that they are wrong) or given.
+        clocks: auto (the cameras' clocks are estimated from the moving parts, and used if they differ) or given.
     """
     wanted = with_settings(get_method(method), settings)
     request = FitRequest(make_budget(budget), choose_device_for([wanted], compute.device), compute.seed)

@@ -37,22 +37,23 @@ def images(
     device: str = "auto",
     allow_gaps: bool = False,
 ) -> int:
-    """Make images of a recording from its spikes: a PNG and an EXR each, and a slow-motion video of them all.
+    """Make images of a recording from its spikes: each as PNG and EXR, and all as a slow-motion video.
 
-    OUT/CAMERA holds the images, named by their ticks, and OUT/CAMERA.mp4 is the video. PNG is 8-bit sRGB, EXR linear
-    radiance with 1 for white. Size and rate are those of a .dat file; a folder states its own. What is finished is
-    kept, a run that was stopped goes on, and other images are never overwritten.
+    OUT/CAMERA contains the images, named by their ticks, and OUT/CAMERA.mp4 is the video. PNG is 8-bit sRGB; EXR is
+    linear radiance, in which 1 is white. Give the size and rate of a .dat file; a folder states its own. The same
+    command keeps finished images and resumes a stopped run. It never overwrites other images.
 
     Args:
         path: A headerless .dat file, a folder of imported streams, or a scene folder.
         out: Folder for the images.
-        method: The image maker: tfp, tfi, tfstp, spk2img, adaptive, intervals or msdi.
+        method: The image maker: tfp, tfi, tfstp, spk2img, adaptive, intervals or msdi; with downloaded weights also
+            ssml, ssir, spikeclip or scflow-tfp.
         every: Ticks from one image to the next.
-        camera: Cameras; all of a folder of streams, or the training cameras of a scene, if none is named.
-        radiance_gain: Spikes per tick of white. If left out it is the scene's, or for streams alone what 1 % of the
-            pixels exceed.
+        camera: Names of cameras; if left out, all of a folder of streams, or the training cameras of a scene.
+        radiance_gain: Spikes per tick of white. If left out, it is the scene's, or for bare streams the charge per tick
+            that 1 % of the pixels exceed.
         fps: Frames per second of the video.
-        device: Of a method with a network: auto, cpu or cuda.
+        device: Device of a method with a network: auto, cpu or cuda.
         allow_gaps: Accept a recording with gaps. Images at missing ticks are left out.
     """
     check_names("--method", [method], IMAGES)

@@ -23,21 +23,22 @@ def import_dat(
     """Import a bare .dat file, or a folder of them (one per camera), as a folder of streams or a scene folder.
 
     The layout is that of `inspect` and of SpikeCV: no header, 1 bit per pixel, row-major, least significant bit first;
-    a tick takes ceil(width * height / 8) bytes. Without cameras the result is the streams and a stream.json, which
-    `inspect` and `calibrate-rig` read. With cameras it is a scene whose cameras are all for training.
+    a tick takes ceil(width * height / 8) bytes. Without --cameras the result is a folder of streams (stream.json), for
+    `inspect`, `images`, `calibrate-rig` and `fit`. With --cameras it is a scene whose cameras are all for training.
 
     Cameras come from a COLMAP model (its folder, text or binary), from OpenCV (a YAML or XML file with a map for each
-    camera, or a folder of files, one for each), or from Kalibr (camchain.yaml). They are named like the .dat files.
-    Lens distortion by OpenCV's k1, k2, p1, p2, k3 is kept (COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV, Kalibr's radtan).
-    Another lens, such as a fisheye, is refused where it distorts by 0.05 px or more.
+    camera, or a folder of files, one for each), or from Kalibr (camchain.yaml). Every .dat file needs a camera of the
+    same name. Lens distortion by OpenCV's k1, k2, p1, p2, k3 is kept (COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV, and
+    FULL_OPENCV without k4 to k6; Kalibr's radtan). Any other lens, such as a fisheye, is refused if it moves a point of
+    the image by 0.05 px or more.
 
     Args:
-        path: A .dat file, or a folder of them; a camera is called like its file.
+        path: A .dat file, or a folder of them; each camera has the name of its file.
         width: Pixels per row.
         height: Rows.
         out: New folder to write.
-        cameras: COLMAP model folder, OpenCV file or folder, or Kalibr file. COLMAP's unit of length is any; a scene's
-            is the metre.
+        cameras: COLMAP model folder, OpenCV file or folder, or Kalibr file. COLMAP's unit of length is arbitrary; a
+            scene's is the metre.
     """
     streams = import_streams(path, out, width=width, height=height, recording=recording, cameras=cameras)
     warn_of_size(streams)

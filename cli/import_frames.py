@@ -25,18 +25,18 @@ def import_frames(
     out: Path,
     points: Path | None = None,
 ) -> int:
-    """Put simulated spike cameras in the places of real ones, and show each of them what that one filmed.
+    """Put a simulated spike camera in the place of each real camera, and show it what that camera filmed.
 
-    Each instant is held still for some ticks: optics, textures, light and calibration are real, the spikes, their rate
-    and the steps from instant to instant are not. The frames of one camera are the truth that is scored.
+    Each instant is held still for some ticks. Optics, textures, light and calibration are real; the spikes, their rate
+    and the steps from instant to instant are not. One camera is held out, and its frames are the ground truth.
 
     Args:
-        path: Folder with a subfolder of images, or a video, for each camera. All have one size and the same number of
+        path: Folder with a subfolder of images, or a video, for each camera. All must have the same size and number of
             frames, taken at the same instants.
-        cameras: COLMAP model folder, OpenCV file or folder, or Kalibr file, as in import-dat; for the frames as filmed.
+        cameras: COLMAP model folder, OpenCV file or folder, or Kalibr file, as in import-dat, for the frames as filmed.
         out: New folder of the scene.
-        points: CSV of points marked in the frames: camera,frame,point,x,y in px, the first pixel's centre at 0,0. Their
-            reprojection errors are printed, which tell whether the cameras fit the footage.
+        points: CSV of points marked in the frames: camera,frame,point,x,y in px, with the first pixel's centre at 0,0.
+            Their reprojection errors are printed, and show how well the cameras fit the footage.
     """
     footage = find_footage(path)
     first = next(iter(footage.values()))

@@ -188,12 +188,12 @@ def inspect(
 ) -> int:
     """Show a scene's streams, or one raw stream: rates, bad pixels, interval statistics, TFP and TFI images.
 
-    Dead, hot and flickering pixels are those of the scene's recordings of uniform light and of darkness. Without them
-    they are the pixels that differ from all of their neighbours. The table is printed, and written as statistics.csv.
+    Dead, hot and flickering pixels are found in the scene's recordings of uniform light and of darkness. Without these,
+    pixels that differ from all of their neighbours count as bad. The table is printed, and written to statistics.csv.
 
     Args:
         path: A scene folder, a folder of imported streams, or a headerless .dat file.
-        out: Folder for a folder of this name: one PNG per stream, and statistics.csv.
+        out: Folder for the results: one PNG per stream and statistics.csv, in a subfolder named after PATH.
         allow_gaps: Accept recordings with gaps.
     """
     opened = open_streams(path, dat_file, allow_gaps)

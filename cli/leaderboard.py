@@ -32,16 +32,16 @@ def show(
     runs: tuple[Path, ...] = (),
     leaderboard: Path | None = None,
 ) -> int:
-    """Print the ranking of each track with the intervals of its ranks.
+    """Print the ranking of each track, with rank intervals and ties.
 
-    The published entries, which come with the package, are among them. Methods whose rank intervals start with the same
-    number cannot be told apart from the best of them. `leaderboard build` writes the same as a page, with filters,
+    The ranking includes the published entries, which come with the package. Methods whose rank intervals start with the
+    same number cannot be told apart from the best of them. `leaderboard build` writes the same as a page, with filters,
     plots and images.
 
     Args:
         track: Only this track.
         metric: Metric to rank by, such as psnr_dynamic.
-        runs: Folders of run-benchmark, to see own methods beside the entries.
+        runs: Folders of run-benchmark, to show your own methods among the entries.
         leaderboard: Leaderboard folder; ./leaderboard if left out, where it has entries.
     """
     if metric not in METRICS:
@@ -68,9 +68,9 @@ def build(
 ) -> int:
     """Write the leaderboard as a page of files, which a browser opens from the disk.
 
-    The page has every board of the leaderboard, and the published entries, with an image of each scene where an entry
-    has a sheet. With --runs it has the reader's own finished runs beside the entries, and all their images where --data
-    has the scenes: a run that equals an entry lends its images to the entry. An earlier page in the folder is replaced.
+    The page shows every board of the leaderboard and the published entries, with an image of each scene if an entry has
+    a sheet. With --runs it also shows your own finished runs, with all their images if --data has the scenes. If a run
+    equals an entry, its images appear in the entry's row. An earlier page in the folder is replaced.
 
     Args:
         out: Folder of the page.

@@ -39,18 +39,18 @@ def make_dataset(
 
     Args:
         worlds: Names of worlds, such as car turntable.
-        all: Make all worlds but those that are hard by design: appear, beads, blank, flash, mirror, rain.
-        out: Folder in which the scene folders appear.
-        also: Options of camera and light of further scenes of each world, such as light=0.25 lens=-0.2,0.03
-            "read-noise=0.006 dead-ticks=1". Scenes that differ in sensors, light, lost ticks or given poses alone are
+        all: Make all worlds except those that are hard by design: appear, beads, blank, flash, mirror, rain.
+        out: Folder for the scene folders.
+        also: Camera and light options of further scenes of each world, such as light=0.25 lens=-0.2,0.03
+            "read-noise=0.006 dead-ticks=1". Scenes that differ only in sensors, light, lost ticks or given poses are
             rendered once.
-        audit: Compare random ticks with full renderings of 4 times the samples, and measure noise; see the report.
-        replace: Make existing scenes again, undamaged ones too.
-        check: A folder of reference scenes, such as a release, or one scene folder. Scenes in OUT are made only where
-            they are absent, and compared with those of the same id there: equal, rendering noise, or a change of the
-            world. A scene that is not equal is rendered again with other noise. The report: OUT/check.md, .json, .png.
-        track: Make the scenes of a track of release 2, which has its profile, variants and camera: small, dev-small,
-            ideal or paper; of all worlds if none is named.
+        audit: Compare random ticks with full renderings of 4 times the samples, and measure the noise; see the report.
+        replace: Make existing scenes again, even undamaged ones.
+        check: A folder of reference scenes, such as a release, or one scene folder. Missing scenes are made in OUT,
+            and each scene is compared with its reference of the same id: equal, rendering noise, or a change of the
+            world. A scene that is not equal is rendered again with other noise. Reports: OUT/check.md, .json, .png.
+        track: Make the scenes of a track of release 2: small, dev-small, ideal or paper. It sets the profile, variants
+            and camera. If no world is named, all nine are made.
     """
     from spike4dgs.generators.worlds import WORLDS  # it loads other packages' worlds
 

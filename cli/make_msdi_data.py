@@ -21,15 +21,15 @@ def make_msdi_data(
     bursts: OmitArgPrefixes[MakeBursts] = DEFAULTS,
     renderers: OmitArgPrefixes[Renderers] = RENDERERS,
 ) -> int:
-    """Render training data of MSDI: shards OUT/WORLD-VARIANT.safetensors, including the three hidden variants.
+    """Render training data for MSDI: shards OUT/WORLD-VARIANT.safetensors, including the three hidden variants.
 
-    Existing shards are kept: a killed run resumes, and a larger --variants adds shards. Equal arguments give equal
+    Existing shards are kept, so a killed run resumes and a larger --variants adds shards. Equal arguments give equal
     bytes, with any number of workers. Variants 0 to 9 of the worlds are never rendered.
 
     Args:
-        worlds: Names of worlds; if none is named, all of the benchmark and those for training only.
+        worlds: Names of worlds; if left out, all of the benchmark and those for training only.
         out: Folder for the shards.
-        variants: Training variants of each world.
+        variants: Number of training variants of each world.
     """
     known = all_worlds()
     check_names("worlds", worlds, known)

@@ -7,27 +7,27 @@ from spike4dgs.cli.command import Command
 MEASUREMENTS: dict[str, Command] = {
     "report speed-error": Command(
         "spike4dgs.cli.studies:speed_error",
-        "measure every approximation beside its exact twin, and write one page",
+        "compare every approximation with its exact counterpart, and measure how costs grow, on one page",
         "report speed-error --quick --out runs/speed-error",
     ),
     "report dark-poses": Command(
         "spike4dgs.cli.studies:dark_poses",
-        "estimate poses from less and less light: the matching network, SIFT and COLMAP on the same spikes",
+        "estimate arrays' poses in less and less light, with the matching network, SIFT and COLMAP",
         "report dark-poses data/matching --out runs/dark-poses",
     ),
     "report dark-points": Command(
         "spike4dgs.cli.studies:dark_points",
-        "find points from less and less light at true poses: the matching network's cost volume and the plane sweep",
+        "find points in less and less light at true poses, with the matching network's cost volume and the plane sweep",
         "report dark-points data/matching --out runs/dark-points",
     ),
     "report hard-cases": Command(
         "spike4dgs.cli.studies:hard_cases",
-        "run hard inputs, seeds, interrupted fits and threads beside independent results, and write one page",
+        "check hard inputs, seeds, interrupted fits and threads against independent results, on one page",
         "report hard-cases --out runs/hard-cases",
     ),
     "report modality": Command(
         "spike4dgs.cli.studies:modality",
-        "fit what spike, frame and event cameras record of the same scenes, and plot it against their bits per second",
+        "fit recordings of the same scenes by spike, frame and event cameras, and plot quality against bits per second",
         "report modality data/turntable-10-small-100ms --out runs/modality",
     ),
     "report oracle-ladder": Command(
@@ -37,12 +37,12 @@ MEASUREMENTS: dict[str, Command] = {
     ),
     "report realism": Command(
         "spike4dgs.cli.studies:realism",
-        "tell a real recording from simulated ones of equal rates: a classifier, statistics, and ranks of image makers",
+        "distinguish a real recording from simulated ones of equal rates: classifier, statistics, image makers' ranks",
         "report realism car.dat --width 400 --height 250 --out runs/realism",
     ),
     "report results": Command(
         "spike4dgs.cli.studies:results",
-        "measure what the published tables show, and write them from the records",
+        "measure what the published tables show, keep a record of each cell, and write the tables from the records",
         "report results --scenes-of data/ideal",
     ),
     "report scene-noise": Command(
@@ -52,17 +52,17 @@ MEASUREMENTS: dict[str, Command] = {
     ),
     "report second-renderer": Command(
         "spike4dgs.cli.studies:second_renderer",
-        "render one tick of three worlds with Cycles too, and tabulate by how much and why it differs",
+        "render one tick of three worlds with Cycles too, and tabulate how much and why it differs",
         "report second-renderer --out runs/second-renderer",
     ),
     "report tuning": Command(
         "spike4dgs.cli.studies:tuning",
-        "search for better settings of recipes, every row by the same search on development scenes",
+        "search for better settings of recipes on development scenes, with the same search for every row",
         "report tuning data/van-10-small data/turntable-10-small --rows tfp+stg spike4dgs-x --out runs/tuning",
     ),
     "spike-agreement": Command(
         "spike4dgs.cli.studies:spike_agreement",
-        "report how well the metrics of a held-out camera's own spikes order methods, against PSNR",
+        "report how well a held-out camera's own spikes rank methods, compared with PSNR",
         "spike-agreement runs/small --data data --out runs/spike-agreement",
     ),
     "speed render": Command(
@@ -72,12 +72,12 @@ MEASUREMENTS: dict[str, Command] = {
     ),
     "speed record": Command(
         "spike4dgs.cli.studies:record",
-        "record emulated cameras into memory and to disk, queued beside single reads",
+        "record emulated cameras into memory and to disk, with queued and single reads",
         "speed record",
     ),
     "speed images": Command(
         "spike4dgs.cli.studies:images",
-        "time and quality of each way from spikes to an image, beside the paper's Table 6",
+        "measure the time and quality of each way to make an image from spikes, next to the paper's table 6",
         "speed images data/car-0-small data/turntable-0-small",
     ),
 }

@@ -20,10 +20,10 @@ _PARTS = tuple(f.name for f in fields(Recipe) if f.name not in ("name", "setting
 
 
 def methods(name: Positional[str | None] = None) -> int:
-    """List the methods of all installed packages with their four parts; or describe one, with its settings.
+    """List the methods of all installed packages with their four parts, or describe one with its settings.
 
-    A dash stands for a part that a method does not name. A star marks a setting that the recipe changes; `run-benchmark
-    --set PART.NAME=VALUE` changes any of them.
+    A dash marks a part that a method does not name. A star marks a setting that the recipe changes. `run-benchmark
+    --set PART.NAME=VALUE` changes any setting.
 
     Args:
         name: Method to describe.

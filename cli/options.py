@@ -1,4 +1,4 @@
-"""Options that several commands have, and what they show white."""
+"""Options that several commands share, and what they show as white."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ WHITE = 99  # percentile of the pixels that is shown white
 
 @dataclass(frozen=True)
 class Renderers:
-    """What renders.
+    """Where the rendering runs.
 
     Args:
-        workers: Processes that render; one uses all cores.
+        workers: Number of rendering processes; a single one uses all cores.
         scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers render.
         device: cpu, cuda (needs an NVIDIA GPU), or auto: the CPU unless SPIKE4DGS_MITSUBA_VARIANT says otherwise.
     """
@@ -42,11 +42,11 @@ RENDERERS = Renderers()
 
 @dataclass(frozen=True)
 class Compute:
-    """What computes, from which random numbers.
+    """Device and random seed.
 
     Args:
         device: auto, cpu or cuda.
-        seed: Seed of everything random.
+        seed: Seed of all random numbers.
     """
 
     device: str = "auto"

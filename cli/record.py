@@ -1,4 +1,4 @@
-"""`record` of the command line is the recorder's own function: its arguments are what a Python caller gives too."""
+"""`record`: the recorder's own function, which Python callers use with the same arguments."""
 
 from __future__ import annotations
 

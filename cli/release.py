@@ -1,4 +1,4 @@
-"""`release pack`, `check`, `publish`, `wheel` and `fingerprint`: make a release, upload it, and know it again."""
+"""`release pack`, `check`, `publish`, `wheel` and `fingerprint`: make a release, upload it, and identify its scenes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from spike4dgs.leaderboard.tracks import scene_name
 def pack(
     scenes: Positional[tuple[Path, ...]], *, out: Path, name: str = "1", shard_mb: int = 1000, flat: bool = False
 ) -> int:
-    """Pack scene folders into uncompressed tars with an index, a dataset card, Croissant and sums.
+    """Pack scene folders into uncompressed tars with an index, a dataset card, Croissant and checksums.
 
     The same scenes give the same bytes. A killed run resumes.
 
@@ -34,8 +34,8 @@ def pack(
         scenes: Scene folders.
         out: Folder of the release.
         name: Name of the release.
-        shard_mb: Size of a tar in 10^6 bytes; a camera that is larger has a tar of its own.
-        flat: Put all files into one folder, as Zenodo needs them.
+        shard_mb: Size of a tar in 10^6 bytes; a larger camera gets a separate tar.
+        flat: Put all files into one folder, as Zenodo requires.
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
         raise problem("--name", "letters, digits, dots, dashes", repr(name), "choose another name")
@@ -51,10 +51,10 @@ def pack(
 
 
 def check(folder: Positional[Path]) -> int:
-    """Check a release as Hugging Face would limit it, and every byte of it.
+    """Check a release against the limits of Hugging Face, and check every byte of it.
 
-    Counts and sizes of files, names, the dataset card, Croissant, all SHA-256, and that the index lists what the tars
-    hold and every file of every scene.
+    This checks the counts, sizes and names of files, the dataset card, Croissant, all SHA-256, and that the index lists
+    what the tars contain and every file of every scene.
 
     Args:
         folder: Folder of the release.
@@ -71,10 +71,10 @@ def check(folder: Positional[Path]) -> int:
 
 
 def publish(folder: Positional[Path], *, to: str, dry_run: bool = False) -> int:
-    """Check a release and upload it: to Zenodo, to Hugging Face, or to a web server that takes PUT.
+    """Check a release and upload it: to Zenodo, to Hugging Face, or to a web server that accepts PUT.
 
-    The token comes from the environment: ZENODO_TOKEN, HF_TOKEN or SPIKE4DGS_UPLOAD_TOKEN. Zenodo's record stays a
-    draft, whose DOI is registered when a person publishes it.
+    The token comes from the environment: ZENODO_TOKEN, HF_TOKEN or SPIKE4DGS_UPLOAD_TOKEN. On Zenodo the record stays a
+    draft; its DOI is registered when you publish it.
 
     Args:
         folder: Folder of the release.
@@ -100,7 +100,7 @@ def publish(folder: Positional[Path], *, to: str, dry_run: bool = False) -> int:
 
 
 def wheel(folder: Positional[Path], *, out: Path = Path("dist"), version: str = "1.0") -> int:
-    """Write a wheel of a small release, by which `pip install` brings its scenes.
+    """Write a wheel of a small release, so that pip can install its scenes.
 
     Args:
         folder: Folder of the release.
@@ -115,7 +115,7 @@ def wheel(folder: Positional[Path], *, out: Path = Path("dist"), version: str = 
 
 
 def fingerprint(scenes: Positional[tuple[Path, ...]], *, out: Path) -> int:
-    """Write the fingerprint of scenes, by which those that another processor made are recognised.
+    """Write the fingerprints of scenes, which identify the same scenes made on other processors.
 
     Args:
         scenes: Scene folders of a release.

@@ -24,11 +24,11 @@ def render(
     """Render a fitted model along a path of cameras, in slow motion, to a video or a folder of images.
 
     Args:
-        model: A model that run-benchmark has saved, OUT/models/METHOD/SCENE.safetensors, or fit, OUT/model.safetensors.
+        model: A model saved by run-benchmark, OUT/models/METHOD/SCENE.safetensors, or by fit, OUT/model.safetensors.
         path: orbit: an ellipse as large as the camera array, around its middle; rig: from training camera to training
-            camera; still: one of them.
+            camera; still: one training camera.
         camera: The training camera of `still`; the middle one if left out.
-        out: Video, .mp4 (VP9) or .avi (Motion JPEG); SCENE-PATH.mp4 if left out, or none where --frames is given.
+        out: Video, .mp4 (VP9) or .avi (Motion JPEG); SCENE-PATH.mp4 if left out, or none if --frames is given.
         frames: New folder for the frames as PNG.
         device: cpu or cuda.
     """

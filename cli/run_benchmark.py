@@ -1,7 +1,7 @@
 """`run-benchmark`: run methods on scenes, then write the table, the images and the leaderboard's entries.
 
-OUT is as `benchmark.reports.benchmark` keeps it, and has leaderboard/ and, for a table of the paper, table.*. A run on
-another split than the default one keeps all this in OUT/SPLIT/, and so does a table that compares splits.
+OUT has the layout of `benchmark.reports.benchmark`, with leaderboard/ and, for a table of the paper, table.*. A run on
+another split than the default keeps all this in OUT/SPLIT/, and so does a table that compares splits.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ class SceneChoice:
     Args:
         table: Instead of scenes, a table of the paper: 1 (outdoor), 2 (objects), 3 (components), 4 (supervision), 5
             (number of views; plotted in views.png), 7 (MSDI without SPSS).
-        poses: Of table 1 or 2: given (methods get the rig's poses) or estimated (each estimates its own).
-        track: Instead of scenes, a track such as ideal: its scenes in DATA; those that are missing are
+        poses: For table 1 or 2: given (methods get the rig's poses) or estimated (each estimates its own).
+        track: Instead of scenes, a track such as ideal. Its scenes are read from DATA, and missing ones are
             downloaded.
-        source: Where the release with the track's scenes lies; SPIKE4DGS_RELEASE if left out.
+        source: Where the release with the track's scenes is; SPIKE4DGS_RELEASE if left out.
         data: Folder of the table's or track's scenes.
         profile: Profile of the table's scenes.
         split: Training views and held-out views, such as corner or views-3; each scene's default if left out.
@@ -80,22 +80,23 @@ class FitChoice:
     """How methods are fitted and scored.
 
     Args:
-        methods: Methods by name; all that are installed, or all rows of the table, if left out.
-        settings: Other settings, such as motion.lr_grid=0.005; rows are named by them, and stay off public tracks.
-        out: Folder for predictions, results, images and logs; for another split than the default, OUT/SPLIT is.
-        seed: Seed that every fit gets.
-        seeds: Number of seeds, from that one up. The table shows means over them; what belongs to a further seed K
-            is in OUT/seed-K.
-        workers: Processes that fit, each on its share of this machine's cores.
+        methods: Names of methods; all installed ones, or all rows of the table, if left out.
+        settings: Other settings, such as motion.lr_grid=0.005. Rows include them in their names, and stay off public
+            tracks.
+        out: Folder for predictions, results, images and logs; OUT/SPLIT for another split than the default.
+        seed: Seed of every fit.
+        seeds: Number of seeds, counted up from --seed. The table shows means over them; files of a further seed K
+            are in OUT/seed-K.
+        workers: Number of fitting processes, each on its share of this machine's cores.
         scheduler: Address of a dask.distributed scheduler, tcp://HOST:PORT, whose workers fit. They read the scenes
             at the same paths.
-        device: auto, cpu or cuda. auto looks at this machine, also for the workers of a scheduler.
+        device: auto, cpu or cuda. auto depends on this machine, even for the workers of a scheduler.
         budget: quick, standard (4 times the steps), paper (each publication's steps), or a multiple of quick.
         metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal
             error are always computed.
-        refit: Fit anew also where OUT holds predictions of the same method, code, settings, scene, seed and budget.
-        in_process: Fit in the benchmark's process, for debuggers. Without it a fit has a process that is given the
-            training part of its scene alone.
+        refit: Fit again even if OUT has predictions of the same method, code, settings, scene, seed and budget.
+        in_process: Fit in the benchmark's process, for debuggers. By default, each fit has a separate process that is
+            given only the training part of its scene.
         columns: Columns of the table on the terminal: short, or all metrics and costs. results.csv has all.
     """
 
@@ -134,9 +135,9 @@ def run_benchmark(
     fits: OmitArgPrefixes[FitChoice] = FitChoice(),
     entries: OmitArgPrefixes[EntryChoice] = EntryChoice(),
 ) -> int:
-    """Fit methods on scenes, score them, and enter them into a leaderboard. A killed run resumes where it was.
+    """Fit methods on scenes, score them, and enter them into a leaderboard. A killed run resumes where it stopped.
 
-    A run with other methods on the same scenes in the same folder adds them to the table and the sheets.
+    Running other methods on the same scenes with the same --out adds them to the table and the sheets.
 
     Args:
         scenes: Scene folders.

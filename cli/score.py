@@ -1,4 +1,4 @@
-"""`score`: score a predictions folder of any program from its files."""
+"""`score`: score a predictions folder from any program."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def score(
     split: str | None = None,
     allow_gaps: bool = False,
 ) -> int:
-    """Score predictions, of any program, from their files. A recording without truth is scored by its held-out spikes.
+    """Score the predictions of any program from their files. Without ground truth, held-out spikes are the reference.
 
     Args:
         predictions: Predictions folder (images, SHA256SUMS, prediction.json); for several scenes, the folder that
@@ -31,7 +31,7 @@ def score(
         out: Write the result record to this file.
         metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal error
             are always computed.
-        split: Split of the scenes that the predictions are for; each scene's default one if left out.
+        split: Split that the predictions are for; each scene's default if left out.
         allow_gaps: Accept recordings with gaps.
     """
     record = score_predictions(predictions, open_scenes(scenes, allow_gaps, split), select_metrics(metrics))

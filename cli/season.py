@@ -45,20 +45,20 @@ def make(
 ) -> int:
     """Draw secret seeds, make the hidden scenes of a season, and write the commitments to them.
 
-    SEASONS/NUMBER/season.json is public: commit and push it now, before anybody submits. SECRET is not. A killed
-    run continues with the same command. Nothing that is committed to is ever changed.
+    SEASONS/NUMBER/season.json is public: commit and push it now, before anybody submits. Keep SECRET private. The same
+    command resumes a killed run. Commitments are never changed.
 
     Args:
         number: Number of the season, from 0 up.
-        worlds: Worlds, one hidden scene of each.
+        worlds: Names of worlds; one hidden scene of each is made.
         secret: Folder for the seeds and the scenes, which only its owner can read.
         profile: Profile of the scenes: tiny, small or paper.
-        rendering: Of the scenes, as make-dataset has it.
-        closes: Last day of submissions, such as 2027-01-31; they end with the reveal if left out.
-        hide_streams: Publish no training streams: methods alone can be submitted.
+        rendering: Rendering of the scenes, as in make-dataset.
+        closes: Last day of submissions, such as 2027-01-31; if left out, they end with the reveal.
+        hide_streams: Publish no training streams, so that only methods can be submitted.
         budget: Budget of methods that the maintainers run: quick, standard, paper, or a multiple of quick.
         fit_seed: Seed of those fits.
-        workers: Processes that render.
+        workers: Number of rendering processes.
         seasons: Folder of the public files.
     """
     from spike4dgs.generators import make_dataset as scenes
@@ -91,9 +91,10 @@ def make(
 
 
 def publish(number: Positional[int], *, secret: Path, out: Path, seasons: Path = SEASONS) -> int:
-    """Write what may be public by now as tars: the scenes' training parts, and after the reveal the whole scenes.
+    """Write tars of what may be public so far: training parts, and whole scenes after the reveal.
 
-    Training parts have no truth: participants fit them and submit predictions. Each tar has the committed SHA-256.
+    Training parts contain no ground truth. Participants fit them and submit predictions. Each tar has the committed
+    SHA-256.
 
     Args:
         number: Number of the season.
@@ -117,14 +118,14 @@ def predict(
 ) -> int:
     """Fit methods on the training parts of hidden scenes, and render the targets for submission.
 
-    OUT/predictions/METHOD is what to submit. A killed run resumes where it was.
+    Submit OUT/predictions/METHOD. A killed run resumes where it stopped.
 
     Args:
-        scenes: Training parts of the season's scenes, unpacked.
-        methods: Methods by name.
+        scenes: Unpacked training parts of the season's scenes.
+        methods: Names of methods.
         out: Folder for predictions, models and logs.
         budget: quick, standard (4 times the steps), paper (the publication's steps), or a multiple of quick.
-        seed: Seed of everything random.
+        seed: Seed of all random numbers.
         device: auto, cpu or cuda.
     """
     chosen = [get_method(name) for name in methods]
@@ -146,17 +147,17 @@ def score(
 ) -> int:
     """Score submissions to a season: predictions of participants, and installed methods, which are run first.
 
-    Methods get the training parts alone, with the season's budget and seed. A name is scored once. Each result is in
-    SEASONS/NUMBER/results, the table in table.md: commit and push both before the reveal.
+    Methods get only the training parts, with the season's budget and seed. A name is scored once. Results are in
+    SEASONS/NUMBER/results, and their table is in table.md. Commit and push both before the reveal.
 
     Args:
         number: Number of the season.
         secret: Folder of `season make`.
         predictions: Predictions folders, each with one folder per scene id.
-        methods: Installed methods by name.
+        methods: Names of installed methods.
         metrics: auto (all that this machine can compute), or ids such as lpips_vgg. PSNR, SSIM and the temporal error
             are always computed.
-        device: Of the methods: auto, cpu or cuda.
+        device: Device of the methods: auto, cpu or cuda.
         seasons: Folder of the public files.
     """
     table, refused = score_season(
@@ -173,7 +174,7 @@ def score(
 def reveal(number: Positional[int], *, secret: Path, seasons: Path = SEASONS) -> int:
     """Publish the seeds of a season: SEASONS/NUMBER/opening.json, whose SHA-256 is the commitment.
 
-    It is refused before the closing day is over, and where nothing was scored. Nothing can be scored afterwards.
+    This is refused until the closing day is over, and if nothing was scored. Nothing can be scored afterwards.
 
     Args:
         number: Number of the season.
@@ -191,12 +192,13 @@ def check(
 ) -> int:
     """Check a season: the revealed seeds against the commitment, the scenes, and the scores.
 
-    Scenes come from the season's tars, or from `make-dataset` with the revealed seeds, whose command lines are printed.
-    Each line says what is right or what could not be checked; errors say what is wrong, and the exit code is then 2.
+    Unpack the scenes from the season's tars, or make them with the printed `make-dataset` commands, which use the
+    revealed seeds. Each line says what is right or what could not be checked. Errors say what is wrong; the exit code
+    is then 2.
 
     Args:
         number: Number of the season.
-        scenes: Folder of the hidden scenes: ID/ as `make-dataset` makes or tar unpacks it, ID.tar, or both.
+        scenes: Folder of the hidden scenes: ID/ (made by `make-dataset` or unpacked from a tar), ID.tar, or both.
         predictions: Folder of the scored predictions, METHOD/ID/, to score them again.
         seasons: Folder of the public files.
     """

@@ -16,12 +16,12 @@ def import_spikecv(
 ) -> int:
     """Import a SpikeCV folder, or a folder of them (one per camera), as a scene folder or a folder of streams.
 
-    With poses the result is a scene whose cameras are all for training and that has no scored images; without, it is
-    the streams and a stream.json, which `inspect` reads. Labels are not imported. Streams whose H*W is no multiple of
-    8 are packed anew, because ours begin every tick on a whole byte. SpikeCV does not record the rate.
+    With poses, the result is a scene whose cameras are all for training, without scored images. Without poses, it is a
+    folder of streams (stream.json), which `inspect` reads. Labels are not imported. Streams whose H*W is not a multiple
+    of 8 are repacked, because ours start every tick on a whole byte. SpikeCV does not store the rate: give --rate-hz.
 
     Args:
-        folder: Folder with config.yaml, or with one such folder per camera; the camera is called like its folder.
+        folder: Folder with config.yaml, or with one such folder per camera; each camera has the name of its folder.
         out: New folder to write.
         transforms: nerfstudio file (JSON) with intrinsics and a pose for each camera, named by the key "camera".
     """
@@ -33,13 +33,13 @@ def import_spikecv(
 def export_spikecv(scene: Positional[Path], out: Path, allow_gaps: bool = False) -> int:
     """Write the streams of a scene as SpikeCV folders, one per camera, rows bottom-up (SpikeCV's default).
 
-    SpikeCV does not store the rate, the poses, the clock, the radiance gain, gaps and the scored images: they are left
-    out. Streams whose H*W is no multiple of 8 are packed anew without padding, as SpikeCV counts bytes.
+    SpikeCV does not store rate, poses, clock, radiance gain, gaps or scored images, so they are left out. Streams whose
+    H*W is not a multiple of 8 are repacked without padding, as SpikeCV does.
 
     Args:
         scene: Scene folder.
         out: New folder; each camera becomes a folder in it.
-        allow_gaps: Export a recording with gaps all the same.
+        allow_gaps: Accept a recording with gaps.
     """
     opened = open_scene(scene, allow_gaps)
     spikecv.export_spikecv(opened, out)

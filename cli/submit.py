@@ -29,22 +29,22 @@ def submit(
 ) -> int:
     """Check a result record and enter it into the leaderboard.
 
-    With predictions and scenes, every hash and every score is computed again and the entry is labelled re-scored;
-    with --refit the method is fitted again too, by a process that is given the training parts of the scenes alone, and
-    the entry is labelled re-fitted. Both get a small sheet of images for the page. Anything else is claimed and
-    gets no rank. A record of a track's scenes and revisions is on that track's board, any other on a local one.
+    With predictions and scenes, every hash and score is computed again, and the entry is labelled re-scored. With
+    --refit the method is also fitted again, by a process that is given only the training parts of the scenes, and the
+    entry is labelled re-fitted. Both get a small sheet of images for the page. Any other entry is labelled claimed and
+    gets no rank. A record of a track's scenes and revisions goes to that track's board, any other to a local one.
     Submitting a record twice changes nothing.
 
     Args:
         result: Result record, as written by score or run-benchmark.
-        predictions: The method's predictions folder, or the folder of one per scene id.
+        predictions: The method's predictions folder, or the folder that holds one per scene id.
         scenes: Scene folders of the record's dataset.
         leaderboard: Leaderboard folder.
         refit: Fit the method again, with the record's seed, budget and device, and compare the scores.
         replace: Replace another record of the same method and seed.
         allow_gaps: Accept recordings with gaps.
-        container: Command that starts the process of the second fit, such as one of bwrap or docker; {work} and {part}
-            in it are the folders that the process needs.
+        container: Command that starts the process of the second fit, such as one with bwrap or docker; {work} and
+            {part} stand for the folders that the process needs.
     """
     if container and not refit:
         raise problem("--container", "--refit beside it", "none", "add --refit, or leave --container out")

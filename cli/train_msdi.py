@@ -35,24 +35,24 @@ def train_msdi(
     rate: float = PUBLISHED["lr_points"],
     compute: OmitArgPrefixes[Compute] = COMPUTE,
 ) -> int:
-    """Train MSDI on bursts of `make-msdi-data`. The same command continues a killed run where it stopped.
+    """Train MSDI on bursts of `make-msdi-data`. The same command resumes a killed run where it stopped.
 
     OUT/msdi-CONFIG.safetensors can be used at any time: set SPIKE4DGS_MSDI to its path. OUT/losses.csv, scores.csv and
-    curves.png show the course, calibration.png how well the confidence is calibrated, README.md is the model card.
+    curves.png show the progress, calibration.png how well the confidence is calibrated; README.md is the model card.
     Shards added to DATA are used from the next start on.
 
     Args:
         data: Folder of shards; those of the hidden variants are only scored.
         out: Folder for all output.
-        config: small, paper (a GPU's work), bottleneck (the network that matches views: of the other options it
-            takes data, out, start, steps and seed, and a larger --steps goes on where the training ended), images
-            (the network that makes images: it takes data, out, start, steps, seed and device), or an ablation of it
+        config: small, paper (for a GPU), bottleneck (the network that matches views: it uses only data, out, start,
+            steps and seed, and a larger --steps continues where the training ended), images (the network that makes
+            images: it uses only data, out, start, steps, seed and device), or an ablation of the latter
             (images-without-spikes, -error-bar, -windows, -beside, -sensor, or -moving-loss).
-        start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file. The
-            steps of bottleneck's weights count.
-        steps: Steps.
-        views: Views of a step in all: samples times views of a sample, of which there are 2 to 8.
-        rate: Adam's learning rate, after the warm-up, of the layers that make points.
+        start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file. For
+            bottleneck, their steps count towards --steps.
+        steps: Number of steps.
+        views: Total number of views per step: samples times views per sample (2 to 8).
+        rate: Adam's learning rate, after the warm-up, for the layers that predict points.
     """
     check_names("--config", [config], (*CONFIGS, *MATCHERS, *IMAGE_NETWORKS))
     if steps < 1 or views < 2 or not rate > 0:

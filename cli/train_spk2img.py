@@ -1,4 +1,4 @@
-"""`train-spk2img`: train the network of the spk2img images on training variants of the worlds."""
+"""`train-spk2img`: train Spk2ImgNet on training variants of the worlds."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ def train_spk2img(
     compute: OmitArgPrefixes[Compute] = COMPUTE,
     allow_gaps: bool = False,
 ) -> int:
-    """Train Spk2ImgNet on training variants of the worlds. A killed run goes on where it was with the same command.
+    """Train Spk2ImgNet on training variants of the worlds. The same command resumes a killed run where it stopped.
 
-    OUT/spk2img-WIDTH.safetensors can be used at any time: set SPIKE4DGS_SPK2IMG to its path. The public benchmark's
-    scenes, variant 0, are refused.
+    OUT/spk2img-WIDTH.safetensors can be used at any time: set SPIKE4DGS_SPK2IMG to its path. Variants that are kept for
+    scores are refused: the public benchmark's (0, 3 and 4), 10 to 12, and hidden seasons' from 9000 on.
 
     Args:
         scenes: Scene folders to train on.
-        hidden: Scene folders that are only scored, while training and at its end.
+        hidden: Scene folders that are only scored, during training and at its end.
         out: Folder for the weights and the checkpoint.
-        width: Channels; 64 is the publication's (a GPU's work), 8 the shipped weights'.
-        steps: Steps of 8 patches of 48x48 pixels (smaller ones where images are smaller).
-        allow_gaps: Accept recordings with gaps; images whose spikes lack ticks are not trained on.
+        width: Channels; 64 in the publication (for a GPU), 8 in the shipped weights.
+        steps: Number of steps, each of 8 patches of 48x48 pixels (smaller if images are smaller).
+        allow_gaps: Accept recordings with gaps; images with missing ticks are not used.
     """
     if width < 1 or steps < 1:
         raise problem("--width and --steps", "numbers from 1 up", f"{width}, {steps}", "correct them")

@@ -12,9 +12,9 @@ from spike4dgs.benchmark.scene.verify import verify_content
 
 
 def verify(scenes: Positional[tuple[Path, ...]]) -> int:
-    """Check size and SHA-256 of every file of scene folders, and that the scenes can be read.
+    """Check the size and SHA-256 of every file of scene folders, and that the scenes can be read.
 
-    Data that is fitted or scored is decoded too: the revision is that of what the files hold.
+    Data that is fitted or scored is decoded too, to check that its contents give the revision.
 
     Args:
         scenes: Scene folders.

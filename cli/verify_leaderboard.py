@@ -35,19 +35,18 @@ def verify_leaderboard(
     refit: bool = False,
     container: str = "",
 ) -> int:
-    """Check a leaderboard: the release is the frozen one, entries and sheets are as submitted, boards follow from them.
+    """Check that the release is the frozen one, entries and sheets are as submitted, and boards follow from them.
 
-    With predictions and scenes, entries are scored again too, as far as their files are there, and what they say of
-    their verification is compared with what comes out. That takes half a minute a scene for second renderings of a
-    target. With --refit those that are labelled re-fitted are fitted again. Problems are listed on stderr, and the exit
-    code is 1.
+    With predictions and scenes, entries whose files are there are also scored again, and the verification that they
+    state is compared with the result. Second renderings of a target take half a minute per scene. With --refit, entries
+    that are labelled re-fitted are fitted again. Problems are listed on stderr, and the exit code is then 1.
 
     Args:
         leaderboard: Leaderboard folder.
         predictions: Folder of a run's predictions, METHOD/SCENE.
         scenes: Scene folders.
         allow_gaps: Accept recordings with gaps.
-        refit: Fit again what is labelled re-fitted.
+        refit: Fit again the entries labelled re-fitted.
         container: Command that starts the process of such a fit, as in `submit`.
     """
     if predictions is not None and not predictions.is_dir():

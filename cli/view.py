@@ -20,13 +20,13 @@ def view(
     allow_gaps: bool = False,
     device: str = "cpu",
 ) -> int:
-    """Show a fitted model in the browser: camera, time, and the spikes beside it. Ctrl-C ends it.
+    """Show a fitted model in the browser, from any view and at any time; with --scene also its spikes. Ctrl-C ends it.
 
     Args:
-        model: A model that run-benchmark has saved, OUT/models/METHOD/SCENE.safetensors, or fit, OUT/model.safetensors.
-        scene: The folder of its scene: also shows spike rates and errors at the training cameras.
-        host: Address to serve at; 0.0.0.0 admits other machines.
-        port: Port to serve at; the next free one where it is taken.
+        model: A model saved by run-benchmark, OUT/models/METHOD/SCENE.safetensors, or by fit, OUT/model.safetensors.
+        scene: Folder of the model's scene, to show spike rates and errors at the training cameras too.
+        host: Address to serve at; 0.0.0.0 lets other machines connect.
+        port: Port to serve at, or the next free one if it is taken.
         allow_gaps: Accept a recording with gaps.
         device: cpu or cuda.
     """

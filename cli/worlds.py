@@ -42,10 +42,10 @@ def worlds(
 ) -> int:
     """Describe worlds in one table, and write it as Markdown.
 
-    Speeds come from the geometry, exactly; moving pixels and depths from rays of the held-out camera at five times.
+    Speeds are exact, from the geometry. Moving pixels and depths come from rays of the held-out camera at five times.
 
     Args:
-        names: Worlds; all, if none is named.
+        names: Names of worlds; all if left out.
         profile: Size and length of the clips: tiny, small or paper.
         variant: Variant of the worlds.
         seed: Seed of the worlds.

@@ -1,19 +1,23 @@
 """The docs say what is true: links resolve, named places exist, every page is in the site, the README is short."""
 
 import ast
+import functools
 import importlib.util
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tyro
 import yaml
 from PIL import Image
 
 from spike4dgs.benchmark.method import FitRequest, check_protocol
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import COMMANDS
+from spike4dgs.cli.dispatch import load
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -130,6 +134,42 @@ def test_the_commands_are_all_described() -> None:
     text = (DOCS / "commands.md").read_text()
     missing = [name for name in COMMANDS if f"`{name}`" not in text]
     assert not missing
+
+
+def documented_commands() -> list[tuple[str, list[str]]]:
+    """The page and the words of each command line in a shell block, without the `spike4dgs` before them."""
+    found = []
+    for page in PAGES:
+        for language, code in _FENCE.findall(page.read_text()):
+            lines = re.sub(r"\\\n", " ", re.sub(r"\s#.*$", "", code, flags=re.M)).replace("\n", " ; ")
+            words = shlex.shlex(lines if language == "sh" else "", posix=True, punctuation_chars=True)
+            words.whitespace_split = True
+            command: list[str] | None = None
+            before = ";"
+            for word in words:
+                if word.endswith("spike4dgs") and re.fullmatch("[;|&()]+|do|.*=.*", before):
+                    found.append((named(page), command := []))
+                elif re.fullmatch("[;|&<>()]+", word):
+                    command = None
+                elif command is not None:
+                    command.append(word)
+                before = word
+    return found
+
+
+def test_the_command_lines_of_the_pages_are_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    commands = documented_commands()
+    assert len(commands) > 150
+    for page, words in commands:
+        verbs = 2 if " ".join(words[:2]) in COMMANDS else 1
+        name, arguments = " ".join(words[:verbs]), words[verbs:]
+        if name == "--help":
+            continue
+        taken = functools.wraps(load(name))(lambda *_, **__: None)
+        try:
+            tyro.cli(taken, args=arguments)
+        except SystemExit as e:
+            assert e.code == 0, f"{page}: spike4dgs {' '.join(words)}\n{capsys.readouterr().err}"
 
 
 @pytest.mark.parametrize("room", ["benchmark", "generators", "method", "baselines", "leaderboard"])

@@ -21,9 +21,9 @@ SMALL_NETWORK = "`spk2img` is a small network that we trained: width 8, publishe
 _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
 _LEGEND = (
-    "Ranks are by PSNR where things move; rows that the intervals do not tell apart share them. After ± is half of a "
-    "95 % interval of the paired difference over scenes, which holds for all rows of a block at once. Times in "
-    "parentheses were measured beside other programs."
+    "Ranks are by PSNR where things move; rows that the intervals cannot tell apart share ranks. The number after ± is "
+    "half of the 95 % interval of the paired difference over scenes, which holds for all rows of a block at once. "
+    "Times in parentheses were measured while other programs ran."
 )
 
 

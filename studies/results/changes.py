@@ -51,7 +51,7 @@ def legend_of(text: str, lines: Iterable[Sequence[str]]) -> str:
     """Return the legend of a table, with a sentence on `OTHER_CODE` where a line has the mark."""
     marked = any(OTHER_CODE in cell for line in lines for cell in line)
     note = (
-        f" {OTHER_CODE}: the two were measured with different code, or at different commits where digests cannot tell, "
-        "which may be a part of the change."
+        f" {OTHER_CODE}: the two were measured with different code, or at commits whose digests cannot be compared. "
+        "That may explain a part of the change."
     )
     return text + note * marked

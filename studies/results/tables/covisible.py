@@ -24,8 +24,8 @@ def covisible_block(records: Sequence[Record]) -> list[str]:
         return [NOTHING]
     heads = ("row", "PSNR", "PSNR, co-visible", "between seeds", "between seeds, co-visible")
     legend = (
-        "dB. Between seeds: the standard deviation of a scene's value, pooled over scenes. Of the conditions the table "
-        f"has the change of the means of {' and '.join(conditions.WORLDS)}."
+        "dB. Between seeds: the standard deviation of a scene's value, pooled over scenes. Of conditions: the change "
+        f"of the means of {' and '.join(conditions.WORLDS)}."
     )
     shown = [record for record in (*own, *under) if METRICS[1] in record["metrics"]]
     groups = realistic.GROUP, *conditions.EVERY

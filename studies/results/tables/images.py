@@ -93,8 +93,8 @@ def images_block(records: Sequence[Record]) -> list[str]:
     scores = ("PSNR / moving", "SSIM", "shading: PSNR / moving", "SSIM", "corrected: PSNR / moving", "SSIM")
     heads = ("images", "ms", *scores, "in table 6", "published PSNR / SSIM")
     legend = (
-        f"Means of {len(TABLE6.scenes)} scenes; milliseconds an image of 200x125, in parentheses those measured beside "
-        "other programs. Shading: corrected by the smooth shading that the array's clips tell, at the given poses. "
+        f"Means of {len(TABLE6.scenes)} scenes; milliseconds for an image of 200x125, in parentheses where other "
+        "programs ran. Shading: corrected by the smooth shading estimated from the array's clips at the given poses. "
         "Corrected images know the camera's flat field and dark recording."
     )
     text = _agreement({maker: rows[maker][0] for maker in measured}) + legend

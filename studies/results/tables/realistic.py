@@ -55,8 +55,8 @@ def cameras_block(records: Sequence[Record]) -> list[str]:
     lines = [[f"`{r.name}`", both_text(o), both_text(r), change_text(r, o)] for r, o in rows]
     heads = ("row", "ideal camera", "realistic camera", "change")
     legend = (
-        f"Whole image / where things move, dB; means of the same {len(pairs)} worlds, variants {PUBLIC_VARIANT}. A "
-        "blur leaves less to get wrong: compare rows within a column."
+        f"Whole image / where things move, dB; means of the same {len(pairs)} worlds, variants {PUBLIC_VARIANT}. "
+        "Blur leaves less detail to get wrong, so compare rows within a column."
     )
     complete = {r.name for r, _ in rows}
     shown_rows = tuple(row for row in GROUP.rows if row.name in complete)

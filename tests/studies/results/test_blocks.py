@@ -101,9 +101,9 @@ Incomplete, not ranked: `c` (1 of 4 scenes: no weights).
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 | 1 | `tfp+stg` | 32.50 |  | 34.50 | 0.9700 | 0.050 | 30 | 121 | 1 |
 
-Ranks are by PSNR where things move; rows that the intervals do not tell apart share them. After ± is half of a 95 \
-% interval of the paired difference over scenes, which holds for all rows of a block at once. Times in parentheses \
-were measured beside other programs.
+Ranks are by PSNR where things move; rows that the intervals cannot tell apart share ranks. The number after ± is half \
+of the 95 % interval of the paired difference over scenes, which holds for all rows of a block at once. Times in \
+parentheses were measured while other programs ran.
 
 Commit c0ffee000000; revisions of 4 scenes a175f1a1ca17; A processor, 2 cores; seeds 0, 1; budget quick; 21 of 24 \
 planned cells, all finite, and 1 that failed. Tuned on: here (`spike4dgs-x`); elsewhere (the others).
