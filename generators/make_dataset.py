@@ -44,16 +44,17 @@ class SceneSettings:
         profile: tiny (4 views, 64x40, 4 ms: for tests), small (9 views, 200x125, 20 ms), paper (9, 400x250, 100 ms).
         seed: Seed of all random numbers: the world's details, the rendering, the sensors.
         variant: Variant of the world; 0, 3 and 4 are the public benchmark, 9000 and up are kept for hidden seasons.
-        seconds: Length of the clip if not the profile's, in whole milliseconds.
+        seconds: Length of the clip, to whole milliseconds; the profile's if left out.
         gain_map: Give every pixel its own sensitivity.
         dark_map: Give every pixel its own dark rate.
         shot_noise: Simulate the random arrival of photons.
-        adaptive_keys: Render each pixel as often as its motion requires, not every changing pixel at every tick (slow).
-        sub_ticks: Render instants inside a tick where the motion in one tick is too large.
-        whole_frames: Trace every pixel of each coarse key, not only the region that changes (slow, and noisier).
+        adaptive_keys: Render each pixel as often as its motion requires. Without it, every changing pixel is rendered
+            at every tick, which is slow.
+        sub_ticks: Render instants inside a tick where the motion within one tick is too large.
+        whole_frames: Trace every pixel of each coarse key frame, not only the region that changes (slow and noisier).
         rendering: paths traces whole paths (release 1); split traces direct light and takes soft light from smoothed
-            maps: a tenth of the noise, denser keys. It needs Mitsuba's LLVM or CUDA variant.
-        physics: What differs from ideal cameras and lamps.
+            maps, with a tenth of the noise and denser key frames. split needs Mitsuba's LLVM or CUDA variant.
+        physics: Deviations from ideal cameras and lamps.
     """
 
     profile: str = "small"

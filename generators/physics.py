@@ -150,36 +150,36 @@ CAMERAS = {
 
 @dataclass(frozen=True)
 class PhysicsOptions:
-    """What differs from ideal cameras and lamps. What is left out is that of --camera.
+    """Deviations from ideal cameras and lamps. Options that are left out have the values of --camera.
 
     Args:
         camera: ideal: pinholes, steady light, a calibration of the same minute. realistic: a lens, principal points,
-            blur and a warmer sensor as published for real cameras; the scene's id ends in -realistic.
-        lens: Distortion of every camera's lens: OpenCV's k1, k2, p1, p2, k3, or the first of them, such as -0.15 0.03;
-            0 is none. Streams, other recordings and ground truth all show it. The scene's id ends in -lens; each of the
-            options below adds its own word.
-        lens_spread: Largest share by which a camera's coefficients differ from --lens, such as 0.3; the seed draws it.
+            blur and a warmer sensor, as published for real cameras; the scene's id ends in -realistic.
+        lens: Distortion of every camera's lens: OpenCV's k1, k2, p1, p2, k3, or the first few, such as -0.15 0.03; 0 is
+            none. Streams, other recordings and ground truth all show it. The scene's id ends in -lens; most of the
+            options below add a word too.
+        lens_spread: Largest relative difference of a camera's coefficients from --lens, such as 0.3, drawn by the seed.
         principal_point: Standard deviation of the principal points from the middle, in image widths, such as 0.013.
-        pose_noise_deg: Standard deviation, in degrees about each axis, of the poses that methods are given.
-        pose_noise_m: Standard deviation, in metres along each axis, of the camera centres that methods are given.
-        psf_px: Standard deviation of the optics' blur in px, a Gaussian, at most 0.8; in streams and in ground truth.
+        pose_noise_deg: Standard deviation, in degrees about each axis, of the errors of the given poses.
+        pose_noise_m: Standard deviation, in metres along each axis, of the errors of the given camera centres.
+        psf_px: Standard deviation of the optics' Gaussian blur in px, at most 0.8; in streams and in ground truth.
         flicker: Depth of the light's flicker, (highest - lowest) / (highest + lowest), such as 0.08.
-        flicker_hz: Frequency of the flicker: 100 where the mains have 50 Hz.
+        flicker_hz: Frequency of the flicker; 100 for mains of 50 Hz.
         flicker_duty: Share of a period in which a dimmed LED is on; 0 is a sine.
         warming_k: Kelvin by which the sensors are warmer in the clip than at calibration; 8 doubles the dark rate.
-        reset_noise: Standard deviation of the charge that a reset takes, in thresholds, such as 0.0009 (kTC).
+        reset_noise: Standard deviation of the charge that a reset removes, in thresholds, such as 0.0009 (kTC).
         read_noise: Standard deviation of the comparator's error in a tick, in thresholds, such as 0.006.
-        dead_ticks: Ticks after its charge is full in which a pixel collects no light; 1 in a published calibration.
-        clock_ripple: How much more or less charge a spike takes by where in the tick it falls, in thresholds, such as
-            0.008, so that pixels lock to whole intervals.
-        light: Share of the light that reaches the sensors, in the clip and at calibration, such as 0.25; above 1
-            highlights saturate. The scene's id says how much: -light1of4.
-        lost_ticks: Share of the clip's ticks that each camera loses, such as 0.05. The scene lists them as gaps:
+        dead_ticks: Ticks for which a pixel collects no light after its charge is full; 1 in a published calibration.
+        clock_ripple: How much the charge of a spike varies with its place in the tick, in thresholds, such as 0.008; it
+            makes pixels lock to whole intervals.
+        light: Share of the light that reaches the sensors, in the clip and at calibration, such as 0.25; above 1,
+            highlights saturate. The scene's id includes it: -light1of4.
+        lost_ticks: Share of the clip's ticks that each camera loses, such as 0.05. The scene lists them as gaps, so
             commands that read it need --allow-gaps.
-        speed: Speed of all motion in units of the world's own, such as 2. The scene's id says how much: -speed2.
-        array_motion: Speed in metres per second of the whole array, which moves along an arc, as on a vehicle or in a
-            hand. The cameras of the scene stay those of the array: all that they see moves against them.
-        array_rotation: Angular speed in degrees per second with which the whole array turns about its middle camera.
+        speed: Speed of all motion, relative to the world's own, such as 2. The scene's id includes it: -speed2.
+        array_motion: Speed of the whole array along an arc in metres per second, as on a vehicle or in a hand. The
+            scene's cameras keep their poses in the array, so everything that they see moves relative to them.
+        array_rotation: Angular speed in degrees per second at which the whole array turns about its middle camera.
         noisy_others: Give the frame cameras shot and read noise, and the event cameras unequal thresholds, shot events
             and a refractory period, as published; spikes and truth do not change.
     """

@@ -22,10 +22,10 @@ class Recording:
 
     Args:
         rate_hz: Ticks per second.
-        radiance_gain: Of a scene, spikes per tick of a pixel at radiance 1 (white). With 1, radiance is in spikes per
-            tick.
-        rows_top_down: The files store the top row first. The usual order of this camera is bottom row first.
-        licence: Licence of a scene.
+        radiance_gain: For a scene, spikes per tick of a pixel at radiance 1 (white). If it is 1, radiance is in spikes
+            per tick.
+        rows_top_down: The files store the top row first (these cameras usually store the bottom row first).
+        licence: Licence of the scene.
     """
 
     rate_hz: float

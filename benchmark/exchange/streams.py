@@ -24,7 +24,7 @@ class DatFile:
         width: Pixels per row of a .dat file.
         height: Rows of a .dat file.
         rate_hz: Ticks per second of a .dat file.
-        rows_top_down: The first row of a .dat file is the top one (cameras of this kind store the bottom row first).
+        rows_top_down: The first row of a .dat file is the top one (these cameras usually store the bottom row first).
     """
 
     width: int | None = None

@@ -16,11 +16,11 @@ class Selection:
     """What is asked for; empty means all. The files at the top of a scene always come along.
 
     Args:
-        scenes: Only these.
-        cameras: Only files of these cameras, beside the scene's own.
-        parts: Only these parts, such as spikes, calibration or images, beside the scene's description.
-        window_ms: Only the streams, from the first to the second millisecond, as OUT/SCENE-START-STOPms: a folder
-            of streams to look at, which is no scene of the track.
+        scenes: Fetch only these scenes.
+        cameras: Fetch only the files of these cameras, and the scene's own.
+        parts: Fetch only these parts, such as spikes, calibration or images, and the scene's description.
+        window_ms: Fetch only the streams, from the first to the second millisecond, to OUT/SCENE-START-STOPms. This is
+            a folder of streams to look at, not a scene of the track.
     """
 
     scenes: tuple[str, ...] = ()

@@ -44,13 +44,13 @@ class Holding:
     """How frames are shown to the simulated cameras.
 
     Args:
-        held_out: Camera that is scored, and from which no method learns.
-        width: Pixels per row of the simulated cameras; frames are averaged down to it, in linear light. Left out: as
-            filmed.
+        held_out: Camera that is scored and that no method sees.
+        width: Pixels per row of the simulated cameras. Frames are averaged down to this width in linear light; as
+            filmed if left out.
         hold_ticks: Ticks for which each instant is held still; 100 are 5 ms.
-        every: Take every so many frames.
-        instants: Number of instants; left out: all.
-        linear: The frames' values are proportional to light; they are no sRGB.
+        every: Take every N-th frame.
+        instants: Number of instants; all if left out.
+        linear: The frames' values are proportional to light, not sRGB.
         licence: Licence of the footage.
         seed: Seed of the sensors' fixed pattern and noise.
     """

@@ -45,8 +45,9 @@ class MakeBursts:
 
     Args:
         rigs: Rigs of nine cameras in each training variant; hidden variants have half as many.
-        instants: Instants of each rig.
-        resting: Further rigs, of many kinds, that see the world at rest at an instant; hidden variants have half.
+        instants: Number of instants of each rig.
+        resting: Additional rigs, of many kinds, that each see the world at rest at one instant; hidden variants have
+            half as many.
         width: Width of the images in pixels.
         height: Height of the images in pixels.
         spp: Samples per pixel of moving objects, a power of two; the static background gets twice as many.

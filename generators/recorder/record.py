@@ -57,7 +57,7 @@ class Emulation:
 
     Attributes:
         emulate: Record an emulated array that sends this scene's streams, to try all steps without hardware.
-        worse_truth: JSON file outside OUT for what was done to each camera, for reports to compare with.
+        worse_truth: JSON file, outside OUT, that lists what was done to each camera, for reports to compare with.
         seed: Seed of the imperfections. A clip and its flat and dark recordings need the same one.
     """
 
@@ -72,8 +72,8 @@ class Streaming:
 
     Attributes:
         continuous: Write to disk while recording, instead of afterwards from memory.
-        buffer_s: Seconds of all cameras that may wait in memory while the disk stalls, with --continuous; no less than
-            twice the reads in flight. By default what half of the free memory holds, 10 at most.
+        buffer_s: With --continuous, seconds of data of all cameras that may wait in memory while the disk stalls; at
+            least twice the reads in flight. By default, as much as half of the free memory holds, but at most 10.
     """
 
     continuous: bool = False

@@ -75,7 +75,7 @@ class Light:
     Attributes:
         flat: Recording under uniform light that becomes part of the scene, for `calibrate` and for methods.
         dark: The corresponding recording in the dark.
-        flat_radiance: Radiance of that light, 1 is white.
+        flat_radiance: Radiance of that light; 1 is white.
     """
 
     flat: Path | None = None

@@ -169,8 +169,8 @@ def model_card(
     commands = "\n".join(f"  `{line}`," for line in data_commands(facts))
     return f"""# Model card: MSDI, configuration `{card.config}`
 
-MSDI takes {config.ticks} ticks of spikes of two or more cameras. It gives an image of each camera, the point that each
-pixel sees in the first camera's frame, with a confidence, and, by PnP, the cameras' poses.
+MSDI takes {config.ticks} ticks of spikes from two or more cameras. It returns an image for each camera, and the point
+that each pixel sees, in the first camera's frame, with a confidence. PnP on these points gives the cameras' poses.
 
 Weights of step {card.steps}, as half floats, sha256 `{sha256}`.
 `{VARIABLE}=FILE` uses other weights of the same format.
@@ -181,9 +181,9 @@ Weights of step {card.steps}, as half floats, sha256 `{sha256}`.
   for training, nor is any world's own rig. Spikes are simulated anew at every use, with random sensors, brightness,
   views and direction of time, and mirrored half of the time.
 - Loss: L1 of radiance for extractor and generator, DUSt3R's confidence-weighted regression of points for the rest.
-- {card.steps} steps of {settings.views} views in all, 2 to {most} of a sample; Adam at
+- {card.steps} steps of {settings.views} views in total, 2 to {most} per sample; Adam at
   {settings.lr_points:g} ({settings.lr_images:g} for extractor and generator) after {settings.warm_up} steps of warm-up,
-  falling to 0 with the cosine over {settings.steps} steps; gradients of both clipped at norm 1; seed {card.seed}. In
+  falling to 0 along a cosine over {settings.steps} steps; gradients of both clipped at norm 1; seed {card.seed}. In
   {settings.unknown_share:.0%} of the steps the intrinsics are withheld, in {settings.raw_share:.0%} the sensors.
 - {began}Commit {harness()["commit"] or "unknown"}. Commands:
 {commands}
@@ -208,9 +208,9 @@ def _measured(card: Card, settings: TrainingSettings) -> str:
     numbers = ", ".join(map(str, HIDDEN_VARIANTS))
     return f"""## Measured on hidden variants
 
-Variants {numbers} of each world, seen by rigs that were not used in training. Intrinsics are known, and so are the
-sensors unless a row says otherwise; up to {settings.most_views} views. A view without a pose counts as 180 degrees.
-Beside this card, `calibration.png` plots expected against true errors, and `curves.png` the training.
+Variants {numbers} of each world, in up to {settings.most_views} views, seen by rigs that were not used in training.
+Intrinsics are known, and so are the sensors unless a row says otherwise. A view without a pose counts as 180 degrees.
+Next to this card, `calibration.png` plots expected against true errors, and `curves.png` shows the training.
 
 | measured | value |
 |---|---|

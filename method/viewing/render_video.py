@@ -26,9 +26,9 @@ class Playback:
     """How a clip is played.
 
     Args:
-        slow_motion: Times slower than the world; 1000 makes 20 s of 20 ms.
+        slow_motion: How many times slower than the world; 1000 turns 20 ms into 20 s.
         fps: Frames per second of the video.
-        scale: Size, as a multiple of the training views' each way.
+        scale: Width and height, as a multiple of the training views'.
     """
 
     slow_motion: float = 1000.0

@@ -46,12 +46,12 @@ class Choice:
             views-8 (table 5), conditions, conditions-refined, conditions-views-3 and -5, content, ceilings (of
             conditions and content), modality, modality-noisy, parts, small, steps-quick, steps-standard, steps-16, or
             trial (two tiny scenes). All but trial if left out.
-        rows: Rows by name; all of the groups if left out.
-        scenes_of: Folder of the scenes. Those of the plan that are not there are left out.
+        rows: Names of rows; all rows of the groups if left out.
+        scenes_of: Folder of the scenes. Planned scenes that it does not contain are skipped.
         out: Folder for predictions and checkpoints.
-        workers: Processes that fit, each on its share of this machine's cores.
-        limit_hours: Begin no further cell after so many hours.
-        quiet: Nothing else runs on this machine: the times count. Cells measured beside other programs are fitted
+        workers: Number of fitting processes, each on its share of this machine's cores.
+        limit_hours: Start no new cell after this many hours.
+        quiet: Nothing else runs on this machine, so the times count. Cells measured while other programs ran are fitted
             again.
         allow_dirty: Measure code that is not committed; its records say so.
     """

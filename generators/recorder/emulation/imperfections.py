@@ -32,11 +32,11 @@ class Imperfections:
     Attributes:
         offset_ticks: Largest offset of a camera's clock; the primary camera's is exact.
         drift_ppm: Largest drift of a camera's clock, in parts per million; the primary camera's is exact.
-        dropped: Share of single ticks of a clip that are lost on the way; the recorder sees gaps.
-        bad_pixels: Bad pixels of each camera: a third each is dead, hot and flickering.
-        gain: Largest difference of a camera's gain from the array's; 0.02 is 2 percent.
-        pose_deg: Rotation between a camera's written and true pose.
-        lens: Share of its lens distortion that a camera's written calibration lacks; 1 writes a pinhole.
+        dropped: Share of the clip's ticks that are lost, one by one, on the way; the recorder sees gaps.
+        bad_pixels: Number of bad pixels of each camera: a third each are dead, hot and flickering.
+        gain: Largest relative difference of a camera's gain from the array's; 0.02 is 2 percent.
+        pose_deg: Rotation between a camera's written and true pose, in degrees.
+        lens: Share of the lens distortion that each camera's written calibration lacks; 1 writes a pinhole.
     """
 
     offset_ticks: float = 0.0

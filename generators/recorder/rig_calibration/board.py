@@ -29,8 +29,8 @@ class Board:
 
     Attributes:
         columns: Inner corners of the board from left to right.
-        rows: Inner corners from top to bottom; one of the two numbers is odd, the other even.
-        square_m: Side of a square in metres; it sets the scale of the calibration.
+        rows: Inner corners from top to bottom. One of the two numbers must be odd, and the other even.
+        square_m: Side of a square in metres, which sets the scale of the calibration.
     """
 
     columns: int = 8

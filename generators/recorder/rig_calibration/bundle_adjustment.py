@@ -78,8 +78,8 @@ class Freedom:
     """The unknown intrinsics.
 
     Attributes:
-        shared_focal: One focal length for all cameras.
-        centered: Principal points stay in the middle of the image.
+        shared_focal: Estimate one focal length for all cameras.
+        centered: Keep the principal points in the middle of the image.
         distortion: Estimate k1 and k2 of every lens. The board must reach the corners of the images.
     """
 
