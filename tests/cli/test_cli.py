@@ -22,13 +22,10 @@ def python(*arguments: str, cwd: Path | None = None, **environment: str) -> subp
     return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=cwd, env=given)
 
 
-def test_help_takes_no_time_of_the_processor_and_imports_nothing_heavy() -> None:
+def test_help_imports_nothing_heavy() -> None:
     loaded = f"[m for m in {HEAVY!r} if m in sys.modules]"
     code = f"import sys; from spike4dgs.cli import main; print(main(['--help']), {loaded}, file=sys.stderr)"
-    before = os.times()
     done = python("-c", code)
-    after = os.times()  # processor time, which other programs hardly change
-    assert after.children_user + after.children_system - before.children_user - before.children_system < 0.5
     assert done.stderr == "0 []\n"
     for name in COMMANDS:
         assert f"  {name} " in done.stdout

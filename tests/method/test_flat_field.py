@@ -10,7 +10,6 @@ from small_scenes import array_cameras
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.scene.calibration import Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.benchmark.spikes.sensor_model import fired, gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.generators.sensor.calibration import dark_map, gain_map
 from spike4dgs.generators.sensor.model import Sensor, random_charge, simulate
@@ -108,11 +107,3 @@ def test_a_network_sees_the_charge_behind_dead_ticks():
     found = make_training_images(scene, scene.cameras, IMAGES["msdi"], image, "cpu").images.numpy()
     assert np.sqrt(np.mean((found - 0.8) ** 2)) < 0.003
     assert infer(scene, device="cpu", calibrated=True).images.mean() == pytest.approx(0.8, rel=0.02)
-
-
-@pytest.mark.parametrize("dead_ticks", [0.0, 0.5, 1.0, 3.0])
-def test_charge_and_spikes_are_each_others_inverse(dead_ticks):
-    charge = np.linspace(0, 2, 50)
-    np.testing.assert_allclose(gathered(fired(charge, dead_ticks), dead_ticks), charge, atol=1e-12)
-    assert np.isfinite(gathered(np.array([0.0, 0.5, 1.0]), dead_ticks)).all(), "a tick with a spike in each is no error"
-    assert dead_ticks or gathered(charge, 0.0) is charge

@@ -69,6 +69,7 @@ class HardCase:
                 accepted.append(f"{name} gave {type(call()).__name__}")
             except UserError as e:
                 messages.append(str(e))
+                assert "\n" not in str(e), "one clear error is one line"
         said = f"refused {len(messages)} of {len(calls)}: {messages[0]}" if messages else "refused nothing"
         self.check(len(accepted), "; ".join([*accepted, said]))
 

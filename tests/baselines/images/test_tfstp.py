@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from slow_images import slow_tfstp_pixel, stream_of
 
 from spike4dgs.baselines.images.table import IMAGES
@@ -23,19 +21,6 @@ def one_row(n: int, *pixels: Any) -> SpikeStream:
     for x, ticks in enumerate(pixels):
         spikes[list(ticks), 0, x] = 1
     return stream_of(spikes)
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(1, 60), st.integers(1, 3), st.integers(1, 5), st.booleans(), st.integers(0, 99))
-def test_images_equal_the_published_equations(n: int, height: int, width: int, bottom_up: bool, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    rate = rng.choice([0, 0.03, 0.1, 0.4, 0.9, 1], (height, width))
-    spikes = (rng.random((n, height, width)) < rate).astype(np.uint8)
-    for tick in {0, n // 3, n - 1}:
-        image = tfstp_image(stream_of(spikes, bottom_up), tick)
-        assert image.dtype == np.float32 and image.shape == (height, width)
-        expected = [slow_tfstp_pixel(list(np.flatnonzero(s)), n, tick) for s in spikes.reshape(n, -1).T]
-        np.testing.assert_allclose(image.ravel(), expected, rtol=1e-6)
 
 
 def test_the_decays_of_a_clip_are_computed_once_for_all_its_images() -> None:

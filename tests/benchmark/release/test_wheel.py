@@ -6,9 +6,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from changes import files_in
 
 from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.release import wheel
+from spike4dgs.benchmark.release.fingerprint import compare, read_fingerprint
 from spike4dgs.benchmark.release.index import Release
 from spike4dgs.benchmark.release.wheel import write_wheel
 from spike4dgs.cli import main
@@ -37,6 +39,24 @@ def test_pip_installs_it_and_its_scenes_open(
 
 def test_the_same_release_gives_the_same_bytes(built: Path, packed: tuple[Path, Release], tmp_path: Path) -> None:
     assert write_wheel(*packed, tmp_path, "1.0").read_bytes() == built.read_bytes()
+
+
+def test_commands_pack_wheel_and_identify_the_same(
+    packed: tuple[Path, Release], built: Path, scene_folders: tuple[Path, ...], tmp_path: Path, capsys
+) -> None:
+    scenes = list(map(str, scene_folders))
+    command = ["release", "pack", *scenes, "--out", str(tmp_path / "1")]
+    assert main([*command, "--name", "a b"]) == main([*command, "--shard-mb", "0"]) == 2
+    said = capsys.readouterr().err
+    assert "--name: expected letters" in said and "--shard-mb: expected at least 1" in said
+    assert main([*command, "--shard-mb", "6"]) == 0
+    assert files_in(tmp_path / "1") == files_in(packed[0])
+    assert main(["release", "wheel", str(packed[0]), "--out", str(tmp_path / "dist")]) == 0
+    assert files_in(tmp_path / "dist") == {built.name: built.read_bytes()}
+    assert main(["release", "fingerprint", *scenes, "--out", str(tmp_path / "prints")]) == 0
+    for scene in map(open_scene, scene_folders):
+        found = read_fingerprint(tmp_path / f"prints/{scene.id}@{scene.revision[:12]}.npz")
+        assert compare(scene, found).is_equivalent
 
 
 def test_its_record_lists_every_file(built: Path) -> None:

@@ -22,6 +22,7 @@ from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import Budget, FitRequest, TrainingScene, UserError, get_method, open_scene
 from spike4dgs.benchmark import method as recipes
+from spike4dgs.benchmark.runs import cell
 from spike4dgs.benchmark.runs.cell import FitClock, Job
 from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.record import check_record, of_scenes
@@ -276,29 +277,31 @@ def test_a_killed_run_resumes_and_equals_an_uninterrupted_one(small_scene: Path,
     assert [without_timings(r) for r in found] == [without_timings(r) for r in expected]
 
 
-def test_the_fit_time_of_a_resumed_fit_is_the_sum_of_its_parts(tmp_path: Path) -> None:
+def test_the_fit_time_of_a_resumed_fit_is_the_sum_of_its_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr(cell.time, "perf_counter", lambda: now)
     path, checkpoint, said = tmp_path / "clock.json", tmp_path / "checkpoint", list[int]()
 
     def progress(done: int, total: int, note: str = "") -> None:
         said.append(done)
 
     first = FitClock(path, checkpoint)
-    first.before = 40.0  # as if it had begun so long ago
+    now += 40
     report = first.watched(progress)
     report(1, 9)
     assert FitClock(path, checkpoint).before == 0, "without a checkpoint everything is done again"
     checkpoint.write_text("half done")
     os.utime(checkpoint, (1.0, 1.0))  # a wall clock that was moved
     report(2, 9)
-    first.before = 50.0
+    now += 10
     report(3, 9)  # no new checkpoint: what comes after is lost with a kill, and done again
     second = FitClock(path, checkpoint)
-    assert second.before == pytest.approx(40, abs=1) and second.seconds() >= second.before
-    second.before += 30
+    assert second.before == second.seconds() == 40
+    now += 30
     checkpoint.write_text("three quarters")
     second.watched(progress)(5, 9)
-    assert FitClock(path, checkpoint).before == pytest.approx(70, abs=2)
-    assert FitClock(path, checkpoint).before == pytest.approx(70, abs=2), "killed before it wrote a checkpoint"
+    assert FitClock(path, checkpoint).before == 70
+    assert FitClock(path, checkpoint).before == 70, "killed before it wrote a checkpoint"
     assert said == [1, 2, 3, 5]
     checkpoint.unlink()
     assert FitClock(path, checkpoint).before == 0

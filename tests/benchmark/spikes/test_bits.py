@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from spike4dgs.benchmark.spikes import bits
 from spike4dgs.benchmark.spikes.sensor_model import charge_after_spike, charge_of_tick
@@ -19,16 +17,6 @@ def reference(packed: np.ndarray, width: int, height: int, flip: bool) -> np.nda
 def random_rows(n: int, width: int, height: int, seed: int) -> np.ndarray:
     """Random bytes; the padding bits of the last byte are random too, and nobody may read them."""
     return np.random.default_rng(seed).integers(0, 256, (n, (width * height + 7) // 8), dtype=np.uint8)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 40), st.integers(1, 41), st.integers(1, 23), st.booleans(), st.integers(0, 99))
-def test_unpack_and_count_equal_numpy(n: int, width: int, height: int, flip: bool, seed: int) -> None:
-    packed = random_rows(n, width, height, seed)
-    expected = reference(packed, width, height, flip)
-    np.testing.assert_array_equal(bits.unpack(packed, width, height, flip), expected)
-    counts = bits.count_bits(packed, width * height).reshape(height, width)
-    np.testing.assert_array_equal(counts[::-1] if flip else counts, expected.sum(0))
 
 
 def test_memory_maps_and_strided_rows(tmp_path: Path) -> None:

@@ -30,25 +30,6 @@ from spike4dgs.leaderboard.submit import submit_all
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
 HOSTILE = '<img src=x onerror="window.hacked=1"></script><script>window.hacked=1</script>'
 OUTDOOR = "bicycle-0-small,car-0-small,jaywalk-0-small,motor-0-small,van-0-small"
-ROWS, SCENES, FILTER_MS = 1000, 45, 100.0
-FILTER = """(async () => {
-  const times = [];
-  const until = async (key) => {
-    while (document.body.dataset[key] !== location.hash) {
-      const channel = new MessageChannel();  // a task of its own, without the delay of a timer
-      await new Promise((resolve) => { channel.port1.onmessage = resolve; channel.port2.postMessage(0); });
-    }
-  };
-  for (const state of %s) {
-    const start = performance.now();
-    location.hash = "#" + state;
-    await until("drawn");
-    document.body.offsetHeight;
-    times.push(performance.now() - start);
-    await until("whole");
-  }
-  return times;
-})()"""
 
 
 def hostile_board() -> Board:
@@ -554,25 +535,12 @@ def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
         assert page.value("document.documentElement.scrollWidth") <= width, "only the table scrolls sideways"
 
 
-def test_a_thousand_rows_of_45_scenes_filter_at_once(
-    shown: Page, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """From the change of a filter to the laid out table, in the page's own clock."""
-    page = shown
-    write_site(tmp_path / "page", [large_board(ROWS, SCENES, 60)])
-    page.show((tmp_path / "page/index.html").as_uri(), "Boolean(document.body?.dataset.whole)", 1400, 900)
-    states = ["motion=paths", "q=9", "scenes=scene-00,scene-01,scene-44", "maxfit=55", "motion=static&images=tfi"] * 4
-    times = page.call("Runtime.evaluate", expression=FILTER % states, awaitPromise=True, returnByValue=True)
-    measured = times["result"]["value"]
-    with capsys.disabled():
-        median, worst = np.median(measured), max(measured)
-        print(f"\n{ROWS} rows x {SCENES} scenes, {len(measured)} filters: ", end="")
-        print(f"median {median:.0f} ms, worst {worst:.0f} ms to the new table")
-    count = text_of(page, "count")
+def test_a_thousand_rows_of_45_scenes_are_filtered_and_drawn_in_part(shown: Page, tmp_path: Path) -> None:
+    write_site(tmp_path / "page", [large_board(1000, 45, 60)])
+    shown.show((tmp_path / "page/index.html").as_uri(), "Boolean(document.body?.dataset.whole)", 1400, 900)
+    go(shown, "motion=static&images=tfi")
     # a third of the rows, every second of them
-    assert count.startswith("167 rows, the first 50 drawn; 833 rows hidden")
-    assert min(measured) < FILTER_MS, "the least disturbed one: other programs only add to it"
-    assert median < 5 * FILTER_MS, "on a machine whose processors all do something else"
+    assert text_of(shown, "count").startswith("167 rows, the first 50 drawn; 833 rows hidden")
 
 
 def test_a_screen_in_the_dark(page: Page) -> None:

@@ -13,7 +13,7 @@ from made_season import NUMBER, WORLDS, Made
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked, sha256_file
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.cli.season import make
+from spike4dgs.cli.season import make, publish
 from spike4dgs.generators.make_dataset import make_dataset
 from spike4dgs.generators.profiles import PROFILES, SPLIT_PROFILES, Job
 from spike4dgs.leaderboard.season.season_file import OPENING_NAME, read_opening
@@ -40,6 +40,16 @@ def test_the_commitments_are_those_of_what_was_made(once: Made) -> None:
         assert scene.training_pack_sha256 == sha256_file(pack_file(once.secret, scene.id, training=True))
     assert season.rendered_on["mitsuba_variant"] == "fake" and season.rendered_on["cpu"]
     assert (season.streams, season.budget, season.fit_seed, season.closes) == ("published", "0.02", 0, None)
+
+
+def test_a_hidden_season_publishes_no_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    render_fakes(monkeypatch)
+    made = Made(tmp_path)
+    assert command(made, worlds=("car",), budget="0.02", hide_streams=True) == 0
+    assert made.season.streams == "hidden"
+    with pytest.raises(UserError, match="expected published streams, found hidden ones"):
+        publish(NUMBER, secret=made.secret, seasons=made.seasons, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_no_secret_is_in_the_public_folder(once: Made) -> None:

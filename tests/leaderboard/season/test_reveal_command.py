@@ -64,9 +64,3 @@ def test_a_pack_that_was_not_committed_to_is_not_published(made: Made) -> None:
     with pytest.raises(UserError, match="expected the committed sha256"):
         publish(NUMBER, secret=made.secret, seasons=made.seasons, out=made.root / "out")
     assert not (made.root / "out").exists()
-
-
-def test_hidden_streams_are_not_published(made: Made) -> None:
-    edit_json(made.public / "season.json", lambda season: season.update(streams="hidden"))
-    with pytest.raises(UserError, match="expected published streams, found hidden ones"):
-        publish(NUMBER, secret=made.secret, seasons=made.seasons, out=made.root / "out")

@@ -2,26 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 from ideal_spikes import fire, gathered, sweeping
-from slow_images import slow_adaptive, slow_intervals, stream_of
+from slow_images import slow_adaptive, stream_of
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.method.images.adaptive import AdaptiveSettings, adaptive_image, half_windows
 from spike4dgs.method.images.intervals import IntervalSettings, intervals
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(1, 5), st.integers(1, 19), st.integers(1, 90), st.booleans(), st.integers(0, 2**31))
-def test_images_are_those_of_the_definition(height, width, n, bottom_up, seed):
-    rng = np.random.default_rng(seed)
-    rates = rng.random((height, width)) * np.where(np.arange(n) < n // 2, 1.0, rng.random())[:, None, None]
-    spikes = fire(rates, rng.random((height, width))) ^ (rng.random((n, height, width)) < 0.02)
-    tick = int(rng.integers(n))
-    found = adaptive_image(stream_of(spikes, bottom_up), tick)
-    np.testing.assert_allclose(found, slow_adaptive(spikes, tick), rtol=1e-6)
 
 
 def test_the_windows_are_settings_of_the_maker():
@@ -78,27 +65,6 @@ def test_the_last_window_covers_the_clip_from_anywhere():
     for n in (1, 2, 3, 400, 2000, 100_000):
         assert half_windows(n)[-1] >= n * (1 - 1e-9)
         assert half_windows(n)[0] == 2
-
-
-@settings(max_examples=30, deadline=None)
-@example(105, False, 9.7, 30.0, 105)  # two spikes that are equally near
-@given(
-    st.integers(30, 120),
-    st.booleans(),
-    st.sampled_from([4.0, 5.0, 9.7, 25.3]),
-    st.sampled_from([10.0, 30.0, 80.0]),
-    st.integers(0, 2**31),
-)
-def test_rates_and_spans_are_those_of_the_definition(n, bottom_up, half, still, seed):
-    rng = np.random.default_rng(seed)
-    rates = rng.random((n, 4, 5)) ** 3 * rng.uniform(0, 1.2, (4, 5))
-    spikes, tick = fire(rates, rng.random((4, 5))), int(rng.integers(n))
-    s = IntervalSettings(half=half, still=still)
-    rate, spans, doubts = intervals(stream_of(spikes, bottom_up), tick, s)
-    slow_rate, slow_spans, _ = slow_intervals(spikes, tick, s)
-    assert doubts is None, "no tick is lost"
-    np.testing.assert_allclose(rate, slow_rate, rtol=1e-6)
-    np.testing.assert_allclose(spans, slow_spans, rtol=1e-6)
 
 
 @pytest.mark.parametrize("wrong", [{"half": 1.9}, {"half": -6.0}, {"still": 0.0}, {"shortest": 7.0}, {"growth": 1.0}])

@@ -44,7 +44,7 @@ def recording(spikes, lost):
 @given(
     st.integers(1, 120),
     st.booleans(),
-    st.sampled_from([0.02, 0.1, 0.4, 0.9]),
+    st.sampled_from([0.0, 0.02, 0.1, 0.4, 0.9]),
     st.sampled_from([1, 3, 9]),
     st.integers(0, 2**31),
 )

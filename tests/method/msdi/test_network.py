@@ -159,14 +159,6 @@ def test_the_papers_size_is_padded() -> None:
     assert tiny().images(spikes(1, 9, 250, 400)).shape == (1, 250, 400)
 
 
-@pytest.mark.parametrize("views", [1, 2, 3, 9, 11])
-def test_any_number_of_views(views: int) -> None:
-    with torch.no_grad():
-        out = tiny()(spikes(1, views, 9, 16, 32))
-    assert out.points.shape == (1, views, 16, 32, 3)
-    assert out.points.isfinite().all() and (out.confidence > 1).all()
-
-
 def test_views_see_each_other_and_samples_do_not() -> None:
     network, x = tiny(), spikes(2, 3, 9, 16, 32)
     with torch.no_grad():
@@ -255,8 +247,9 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         network(spikes(1, 2, 9, 16, 32), torch.eye(3).expand(2, 3, 3))
 
 
-def test_float32_agrees_with_float64() -> None:
-    network, x = tiny(), spikes(1, 3, 9, 25, 40)
+@pytest.mark.parametrize("views", [1, 3, 11])
+def test_float32_agrees_with_float64(views: int) -> None:
+    network, x = tiny(), spikes(1, views, 9, 25, 40)
     with torch.no_grad():
         single = network(x)
         double = network.double()(x.double())
@@ -309,23 +302,6 @@ def test_sizes_are_those_of_the_papers_parts_and_of_the_budget() -> None:
     assert tuple(paper.encoder.patch_embed.weight.shape) == (1024, 3, 16, 16)
     assert len(paper.fusion.blocks) == len(small.fusion.blocks) == 24
     assert 5e6 < count(small) < 15e6
-
-
-def test_training_fits_one_sample() -> None:
-    network = tiny(1).train()
-    x = spikes(1, 2, 9, 16, 32)
-    v, u = torch.meshgrid(torch.linspace(-0.4, 0.4, 16), torch.linspace(-0.8, 0.8, 32), indexing="ij")
-    truth = torch.stack([3 * u, 3 * v, 3 + u], dim=-1).expand(1, 2, -1, -1, -1)
-    optimizer = torch.optim.Adam(network.parameters(), 5e-3)
-    losses = []
-    for _ in range(30):
-        out = network(x)
-        parts = point_loss(out.points, out.confidence, truth), image_loss(out.images, x.mean(dim=2))
-        losses.append([float(p.detach()) for p in parts])
-        optimizer.zero_grad()
-        sum(parts).backward()  # type: ignore[union-attr]
-        optimizer.step()
-    assert losses[-1][0] < losses[0][0] - 0.4 and losses[-1][1] < 0.5 * losses[0][1]
 
 
 @pytest.mark.parametrize(("capability", "units"), [((7, 5), False), ((8, 0), True), ((12, 0), True)])

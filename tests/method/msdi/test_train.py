@@ -42,12 +42,6 @@ def trained(data: Bursts) -> tuple[Training, list[float], list[float]]:
     return training, [x.image_l1 for x in losses], [x.points for x in losses]
 
 
-def test_training_on_one_burst_learns_images_and_points(trained: tuple[Training, list[float], list[float]]) -> None:
-    _, images, points = trained
-    assert np.mean(images[-20:]) < 0.6 * np.mean(images[:5])
-    assert np.mean(points[-20:]) < 0.7 * np.mean(points[:5])
-
-
 def test_random_weights_are_clearly_worse(data: Bursts, trained: tuple[Training, list[float], list[float]]) -> None:
     batches = data.fixed(1, 4, TINY.ticks)
     learned = evaluate(trained[0].network, batches, "cpu").measured

@@ -12,7 +12,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.plane_sweep import inverse_depth_step
-from spike4dgs.method.starts.rig import rig
+from spike4dgs.method.starts.rig import middle_camera, rig
 
 STATIC = ToyWorld(width=96, height=60, n_ticks=200, travel=0.0)
 MOVING = ToyWorld(width=96, height=60, n_ticks=240, travel=0.5)  # 18 px
@@ -90,18 +90,12 @@ def test_background_that_the_middle_of_the_clip_hides_is_found_at_its_ends(t: fl
     assert on_wall.sum() > 0.35 * shown.sum()  # about 0.5; 0.2 to 0.25 without the clip's ends
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_points_by_chance_are_not_taken_for_a_scene(seed: int) -> None:
     s = rig(gray_scene(SMALL.training.cameras[:4], seed))
-    assert len(s.points) >= 100 and s.points.dtype == s.values.dtype == np.float32
-    assert np.isfinite(s.points).all() and np.isfinite(s.values).all()
-    assert np.median(s.values) == pytest.approx(0.5, abs=0.1)
-
-
-def test_two_cameras_and_a_clip_shorter_than_a_window_are_enough_to_begin() -> None:
-    scene = SMALL.training
-    s = rig(dataclasses.replace(scene, cameras=scene.cameras[:2], streams=scene.streams[:2]))
-    assert len(s.points) >= 100 and np.isfinite(s.points).all()
+    z = middle_camera(s.cameras).project(s.points.astype(np.float64))[1]
+    np.testing.assert_allclose(z, 1 / inverse_depth_step(s.cameras), rtol=1e-4)  # all where nothing is known
+    assert len(s.points) >= 100 and np.median(s.values) == pytest.approx(0.5, abs=0.1)
 
 
 def test_two_cameras_match() -> None:

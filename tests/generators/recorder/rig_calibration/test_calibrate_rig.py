@@ -82,6 +82,14 @@ def test_the_command_finds_the_array_from_spikes(clip, tmp_path, capsys):
     assert (tmp_path / "corners.png").stat().st_size > 20_000
 
 
+def test_the_command_estimates_what_is_asked_of_it(clip, tmp_path):
+    arguments = ["calibrate-rig", str(clip), "--out", str(tmp_path), "--views", "12", "--window-ticks", "40"]
+    assert main([*arguments, "--shared-focal", "--centered", "--distortion"]) == 0
+    found = read_calibration(tmp_path / "calibration.toml", WIDTH, HEIGHT).values()
+    assert len({(c.fx, c.cx, c.cy) for c in found}) == 1
+    assert all((c.cx, c.cy) == (WIDTH / 2, HEIGHT / 2) and c.distortion for c in found)
+
+
 def test_the_command_states_a_fix(clip, tmp_path, capsys):
     assert main(["calibrate-rig", "--out", str(tmp_path)]) == 2
     assert "record the board" in capsys.readouterr().err
