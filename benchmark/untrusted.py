@@ -222,3 +222,8 @@ def parse_yaml(text: str, maps: Collection[str] = ()) -> Any:
         raise ValueError("values nested too deep") from None
     except (yaml.YAMLError, ValueError, OverflowError, LookupError, TypeError, AttributeError) as e:
         raise ValueError(str(e)[:200]) from None
+
+
+def printable(text: str) -> str:
+    """Return a text, such as a file's name, with all that no terminal shows and no JSON file holds written out."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

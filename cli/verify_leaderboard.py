@@ -14,7 +14,7 @@ from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.record import Record
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.cli.submit import second_renderings_of
-from spike4dgs.leaderboard.submit import WORK, fit_again
+from spike4dgs.leaderboard.submit import fit_again, refits_of
 from spike4dgs.leaderboard.tracks import current_release
 from spike4dgs.leaderboard.verify import verify_leaderboard as check
 
@@ -58,7 +58,7 @@ def verify_leaderboard(
     release = current_release()
 
     def again(record: Record, opened: Sequence[Scene]) -> object:
-        return fit_again(record, opened, leaderboard / WORK, make_console(), Apart(container))
+        return fit_again(record, opened, refits_of(leaderboard), make_console(), Apart(container))
 
     found = check(leaderboard, predictions, scenes, allow_gaps, second_renderings_of, again if refit else None)
     for line in found.problems:

@@ -101,7 +101,7 @@ def entry_path(record: Mapping[str, Any], archived: bool = False) -> str:
     check_method_name(name)
     if name.partition(".")[0].casefold() in _RESERVED or name.endswith("."):
         raise problem("method", "a name that every system takes as a file's", repr(name), "rename the method")
-    if seed is not None and not 0 <= seed < 2**63:
+    if seed is not None and not (type(seed) is int and 0 <= seed < 2**63):  # JSON's 1.0 would be one more entry
         raise problem("method", "a seed from 0 up, of 64 bits", str(seed)[:40], "choose another seed")
     folder = place_of(record).folder
     if archived:
@@ -174,9 +174,14 @@ def check_numbers(value: Any, where: Path) -> None:
 
 
 def read_ledger(leaderboard: Path) -> Ledger:
-    """Return the lines of the ledger; none where there is no such file. Raises UserError for a damaged line."""
+    """Return the lines of the ledger; none in a leaderboard without entries.
+
+    Raises UserError for a damaged line, and where there are entries and no ledger.
+    """
     path = leaderboard / LEDGER
     if not path.is_file():
+        if next(entry_paths(leaderboard, *FOLDERS), None):
+            raise problem(path, "the ledger of the entries", "none", "restore the file from version control")
         return frozenset()
     found = set()
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
@@ -213,7 +218,8 @@ def write_entry(
 
     An entry that makes the same claim takes over a better verification, and thumbnails if its own are missing; with
     `replace` others of both. The caller holds the leaderboard's lock. Raises UserError where the method has another
-    record there, unless `replace`, and where another method's name differs by case alone.
+    record there that is verified better, or any but a claimed one unless `replace`, and where another method's name
+    differs by case alone.
     """
     name = entry_path(record)
     path = leaderboard / name
@@ -238,7 +244,11 @@ def write_entry(
                 if not better and thumbnails is None:
                     return old
                 entry = {**old, "verification": dict(verification)} if better else old
-            elif not replace:
+            elif _confidence(entry)[0] < _confidence(old)[0]:
+                found = f"one that is {entry['verification']['label']}"
+                fix = "submit it with its predictions and scenes, and with --refit where the old one has it"
+                raise problem(path, f"a record verified as well as the {old['verification']['label']} one", found, fix)
+            elif not (replace or old["verification"]["label"] == CLAIMED != entry["verification"]["label"]):
                 fix = "pass --replace to put the new record in its place"
                 raise problem(path, "no entry of this method, or the same record", "another record", fix)
     if thumbnails:
@@ -265,7 +275,8 @@ def remove_parts(leaderboard: Path) -> None:
     """
     for pattern in (".*.part*", *(f"{folder}/*/.*.part*" for folder in FOLDERS)):
         for part in leaderboard.glob(pattern):
-            part.unlink(missing_ok=True)
+            if part.is_symlink() or not part.is_dir():
+                part.unlink(missing_ok=True)
     listed = {leaderboard / path for _, path in read_ledger(leaderboard)}
     for sheet in sheets(leaderboard, *FOLDERS):
         if (entry := sheet.with_suffix(".json")) in listed and not entry.is_file():

@@ -27,6 +27,7 @@ from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.runs.record import COSTS, Record, is_complete
 from spike4dgs.benchmark.runs.refinement import is_refined
 from spike4dgs.benchmark.schemas import check_schema, load_schema
+from spike4dgs.benchmark.untrusted import printable
 from spike4dgs.leaderboard.entry import BOARD, CLAIMED, LABELS, Entry
 from spike4dgs.leaderboard.reading import Reading, read_briefs
 from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, current_release, dataset_revision, on_release, place_of
@@ -75,7 +76,7 @@ def make_boards(reading: Reading) -> dict[str, dict[str, Any]]:
             "primary": PRIMARY,
             "metrics": [{key: getattr(m, key) for key in keys} for m in METRICS.values()],
             "boards": list(_public(entries) if folder == PUBLIC else _others(entries, folder)),
-            "refused": [{"entry": path, "reason": reason} for path, reason in sorted(refused.items())],
+            "refused": [{"entry": printable(path), "reason": reason} for path, reason in sorted(refused.items())],
         }
         check_schema(board, schema, name, "restore the entries")
         found[folder] = board

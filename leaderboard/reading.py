@@ -21,6 +21,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import read_bytes, read_json, user_cache, write_bytes
 from spike4dgs.benchmark.metrics.table import PRIMARY
 from spike4dgs.benchmark.runs.record import with_later_metrics
+from spike4dgs.benchmark.untrusted import printable
 from spike4dgs.leaderboard import tracks
 from spike4dgs.leaderboard.entry import (
     FOLDERS,
@@ -94,7 +95,7 @@ def _read(leaderboard: Path, folders: tuple[str, ...], known: Known, brief: bool
         where = leaderboard / path
         try:
             data = read_bytes(where, KIND)
-            digest = hashlib.sha256(path.encode() + b"\0" + data).hexdigest()
+            digest = hashlib.sha256(path.encode(errors="surrogateescape") + b"\0" + data).hexdigest()
             if digest in known:
                 sha256, facts = found[digest] = known[digest]
                 entry = facts if brief else _without_checks(data)
@@ -106,7 +107,7 @@ def _read(leaderboard: Path, folders: tuple[str, ...], known: Known, brief: bool
             check_listed(sha256, path, where, ledger)
             reading.entries[path], reading.hashes[path] = entry, sha256
         except UserError as e:
-            reading.refused[path] = str(e).removeprefix(f"{where}: ")
+            reading.refused[path] = printable(str(e).removeprefix(f"{where}: "))
     return reading, found
 
 

@@ -6,14 +6,13 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from secrets import token_hex
 from typing import Any
 
 from rich.console import Console
 
 from spike4dgs.benchmark.environment import environment, harness, utc_now
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import sha256_json, user_cache, write_bytes, write_text
+from spike4dgs.benchmark.files import sha256_json, user_cache
 from spike4dgs.benchmark.method import PAPER, Budget, Method, choose_device_for, get_method
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
@@ -65,7 +64,6 @@ def fit_again(record: Record, scenes: Sequence[Scene], work: Path, console: Cons
     """
     name = record["method"]["name"]
     method = get_method(name.removesuffix(SUFFIX))
-    _keep_only_ours(work)
     out = work / sha256_json([record["method"], record["dataset"]])[:16]
     psnr, costs, bit_equal = dict[str, float](), dict[str, Mapping[str, float | None]](), True
     for scene in (s for s in scenes if s.id in record["scenes"]):
@@ -109,20 +107,9 @@ def _fit_scene(
     return cell
 
 
-WORK = ".refit"  # of second fits, below the leaderboard
-_MARK = ".made-by"  # in it: a secret of this user, which nobody who sends a folder knows
-
-
-def _keep_only_ours(work: Path) -> None:
-    """Remove a folder of second fits that this user did not begin: a sent one may hold anybody's predictions."""
-    secret, mark = user_cache() / "refit-secret", work / _MARK
-    if not secret.is_file():
-        write_text(secret, token_hex(32))
-        secret.chmod(0o600)
-    if not mark.is_file() or mark.read_bytes() != secret.read_bytes():
-        shutil.rmtree(work, ignore_errors=True)
-        write_bytes(mark, secret.read_bytes())
-        mark.chmod(0o600)
+def refits_of(leaderboard: Path) -> Path:
+    """Return the folder of a leaderboard's second fits: the user's, as a sent leaderboard may hold any predictions."""
+    return user_cache() / "refits" / sha256_json(str(leaderboard.resolve()))[:16]
 
 
 @dataclass(frozen=True)
@@ -202,7 +189,7 @@ def _verify(result: Path, files: Files, leaderboard: Path) -> Verified:
     rescored = verify_record(record, result, files.predictions, opened, files.second_renderings)
     refit = None
     if files.refit:
-        refit = fit_again(record, opened, leaderboard / WORK, make_console(), Apart(files.container))
+        refit = fit_again(record, opened, refits_of(leaderboard), make_console(), Apart(files.container))
     verification = {
         "label": RE_FITTED if refit else RE_SCORED,
         "unverified": [m for m in METRICS if m in rescored.unverified],

@@ -22,6 +22,7 @@ from spike4dgs.benchmark.runs.predictions import SUMS, read_info
 from spike4dgs.benchmark.runs.record import COSTS, Cell, Record, same_value, sensor_of
 from spike4dgs.benchmark.runs.score import open_for, prediction_folders, score_scene
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
+from spike4dgs.benchmark.untrusted import printable
 from spike4dgs.leaderboard.entry import CLAIMED, FOLDERS, RE_FITTED, Entry, check_folder
 from spike4dgs.leaderboard.rank import FILES, flags_of, make_boards
 from spike4dgs.leaderboard.reading import Reading, read_all
@@ -164,7 +165,7 @@ def verify_leaderboard(
     check_folder(leaderboard)
     reading = read_all(leaderboard, *FOLDERS)
     entries = reading.entries
-    problems = [f"{leaderboard / path}: {reason}" for path, reason in reading.refused.items()]
+    problems = [f"{leaderboard / printable(path)}: {reason}" for path, reason in reading.refused.items()]
     problems += [*_stale_boards(leaderboard, make_boards(reading)), *_wrong_sheets(leaderboard, reading)]
     scored = not_fitted = 0
     if predictions is not None:

@@ -134,6 +134,10 @@ class _Download:
             os.replace(pending, finished)
             (root / _STARTED).unlink(missing_ok=True)
         listed = manifest.read_manifest(root)
+        for _, m in found:
+            if m is not own and m.path in listed.files and listed.files[m.path][1] != m.sha256:
+                fix = "the release was packed wrongly: tell its owner"
+                raise problem(root / m.path, f"the file of {manifest.NAME}", "another one", fix)
         for name in listed.recorded:
             if (root / name).is_file():  # some are not asked for
                 listed.path(name)

@@ -183,14 +183,10 @@ class PredictionWriter:
         write_exr(self._part / f"{target.name}.exr", image, t_us)
         self._names.append(f"{target.name}.exr")
 
-    def take(self, target: Target, path: Path) -> None:
-        """Take over the file of an image that another process wrote. Raises UserError where it is no plain file."""
-        if path.is_symlink() or not path.is_file():
-            raise problem(path, "an image of a target", "none", "correct the method that rendered it")
-        name = f"{target.name}.exr"
-        (self._part / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.move(path, self._part / name)
-        self._names.append(name)
+    def add_file(self, target: Target, data: bytes) -> None:
+        """Store the file of an image that another process wrote."""
+        write_bytes(self._part / f"{target.name}.exr", data)
+        self._names.append(f"{target.name}.exr")
 
     def finish(self, info: PredictionInfo) -> None:
         """Write SHA256SUMS and prediction.json."""

@@ -115,7 +115,9 @@ def _write(
 def _is_empty(folder: Path) -> bool:
     """Return whether a folder holds no more than folders and what a killed page left half written."""
     left = Path(MARK).stem
-    return all(path.is_dir() or path.name.startswith(f".{left}.") for path in folder.rglob("*"))
+    return all(
+        (path.is_dir() and not path.is_symlink()) or path.name.startswith(f".{left}.") for path in folder.rglob("*")
+    )
 
 
 def _write_scores(board: Board, number: int, put: Callable[[str, Any], None]) -> list[str]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -71,9 +72,28 @@ def test_half_written_files_of_killed_processes_block_nobody(entered: Path) -> N
     for part in (path.with_name(".rough.part.json"), path.with_name(".tfp+4dgs.77.part.json")):
         part.write_text('{"half":')
     (entered / "board/.leaderboard.9.part.json").write_text("{")
+    (path.parent / ".a.part").mkdir()  # no process of ours left that
+    (path.parent / os.fsdecode(b"caf\xe9.json")).write_text("{")
     enter(entered, "rough")
-    assert len(board(entered)["boards"][0]["rows"]) == 2 and not board(entered)["refused"]
+    assert len(board(entered)["boards"][0]["rows"]) == 2
+    assert [refused["entry"].partition("/caf")[2] for refused in board(entered)["refused"]] == ["\\udce9.json"]
     assert not [name for name in files_in(entered / "board") if ".part" in name]
+    assert (path.parent / ".a.part").is_dir()
+
+
+def test_a_lost_ledger_is_not_replaced_by_a_new_one(entered: Path) -> None:
+    (entered / "board/LEDGER").unlink()
+    for name in ("tfp+4dgs", "rough"):
+        with pytest.raises(UserError, match="LEDGER: expected the ledger of the entries, found none; restore"):
+            enter(entered, name)
+    assert not (entered / "board/LEDGER").exists()
+
+
+def test_a_seed_is_a_whole_number(entered: Path) -> None:
+    record = read(entry_of(entered))["record"]
+    record["method"]["seed"] = 1.0  # JSON Schema takes it for an integer, and a file's name does not
+    with pytest.raises(UserError, match="a seed from 0 up"):
+        entry_path(record)
 
 
 def test_sheets_without_an_entry_go_if_the_ledger_knows_them(entered: Path) -> None:

@@ -15,6 +15,7 @@ from submissions import board, enter, entry_of, read, release_of, submit
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_json, write_bytes
 from spike4dgs.cli.submit import submit_all
+from spike4dgs.leaderboard.submit import refits_of
 
 
 def test_with_files_an_entry_is_re_scored(done: Path, released: None, said: Any) -> None:
@@ -144,7 +145,7 @@ def test_a_second_fit_is_compared_and_its_costs_stand_beside_the_claimed_ones(
     costs, seconds = row["costs"]["fit_seconds"], sum(c["fit_seconds"] for c in refit["costs"].values())
     assert row["label"] == "re-fitted" and costs["re-fitted"] == pytest.approx(seconds) != costs["claimed"]
     assert "tfp+4dgs: re-fitted, rank 1 of 1" in said()
-    assert [path.name for path in (entered / "board/.refit").iterdir()] == [".made-by"]
+    assert not list(refits_of(entered / "board").iterdir())
 
 
 def test_a_method_that_finds_the_held_out_stream_is_not_fitted_again(done: Path, installed: dict[str, Any]) -> None:
@@ -158,7 +159,7 @@ def test_a_method_that_finds_the_held_out_stream_is_not_fitted_again(done: Path,
 def test_a_score_that_the_method_does_not_reach_is_refused_whatever_second_fits_are_sent(
     done: Path, installed: dict[str, Any]
 ) -> None:
-    """The method comes with `.refit`, in which the claimed images wait."""
+    """The leaderboard comes with folders in which the claimed images wait."""
     installed["tfp+4dgs"] = Darker("tfp+4dgs")
     record = json.loads((done / "out/results/tfp+4dgs.json").read_text())
     work = done / "board/.refit" / sha256_json([record["method"], record["dataset"]])[:16]
@@ -203,3 +204,22 @@ def test_the_second_fit_has_the_records_seed(done: Path, installed: dict[str, An
         edit_json(info, lambda p: p["method"].update(seed=None))
     with pytest.raises(UserError, match="a scored cell with budget and seed"):
         enter(done, refit=True)
+
+
+def test_a_better_verified_entry_is_kept_and_a_claimed_one_gives_way(done: Path) -> None:
+    path = enter(done, verified=False)
+    edit_json(done / "out/results/tfp+4dgs.json", lambda r: r.update(command="another"))
+    result = done / "out/results/tfp+4dgs.json"
+    edit_json(result, lambda r: r["method"].update(version="9"))
+    claimed = read(path)["record"]["method"]["version"]
+    with pytest.raises(UserError, match="pass --replace"):
+        enter(done, verified=False)
+    assert read(path)["record"]["method"]["version"] == claimed
+    edit_json(result, lambda r: r["method"].update(version=claimed))
+    entered = read(enter(done))
+    assert entered["verification"]["label"] == "re-scored", "what was only claimed gives way"
+    edit_json(result, lambda r: r["method"].update(version="9"))
+    for replace in (False, True):
+        with pytest.raises(UserError, match="as well as the re-scored one, found one that is claimed"):
+            enter(done, verified=False, replace=replace)
+    assert read(path) == entered

@@ -42,6 +42,7 @@ from spike4dgs.benchmark.runs.apart.messages import (
     packed_method,
     parse_line,
     read_costs,
+    read_image,
     send,
 )
 from spike4dgs.benchmark.runs.apart.training_part import write_nameless_part
@@ -136,13 +137,13 @@ def _take(job: Job, folders: Sequence[Path], model_path: Path, work: Path, child
             costs = read_costs(child.wait(RENDERED), child.where)
             writer = unfinished.enter_context(PredictionWriter(folder))
             for target in job.scene.targets:
-                writer.take(target, images_folder(work, number) / f"{target.name}.exr")
+                writer.add_file(target, read_image(images_folder(work, number), f"{target.name}.exr"))
             writer.finish(prediction_info(job, method, costs))
             if not number:
                 views = views_of(job.scene) if len(folders) > 1 else ()
                 child.send(Rest(provenance_of(job, cast(float, costs["fit_seconds"])), views))
         child.wait(DONE)
-        if (work / MODEL).is_file():
+        if (work / MODEL).is_file() and not (work / MODEL).is_symlink():
             model_path.parent.mkdir(parents=True, exist_ok=True)
             os.replace(work / MODEL, model_path)
 
@@ -196,7 +197,7 @@ class _Child:
 
 @contextmanager
 def _training_part(job: Job, work: Path) -> Iterator[Path]:
-    """Write the training part and remove it at the end. On the scene's disk its files are links, on others copies.
+    """Write the training part and remove it at the end.
 
     Each has a folder of its own among the work, where nothing of the scene is near: the process of a fit whose caller
     was killed may still be removing another.

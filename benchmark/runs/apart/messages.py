@@ -9,13 +9,16 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import stat
 import struct
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import MOST_BYTES, read_bytes
 from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.method import GROUP, Budget, Method, find_methods, get_method
 from spike4dgs.benchmark.plugins import is_distributed
@@ -30,6 +33,7 @@ COSTS = ("fit_seconds", "render_fps", "peak_memory_mb", "model_mb")
 MODEL = "model.safetensors"  # in the work folder
 MOST = 1 << 20  # bytes of a line
 _LENGTH = struct.Struct("<Q")
+_PLAIN = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # a FIFO does not hold the reader
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,33 @@ class Rest:
 def images_folder(work: Path, variant: int) -> Path:
     """Return the folder for the images of a variant: 0 at the calibrated poses, 1 at refined ones."""
     return work / f"images-{variant}"
+
+
+def read_image(folder: Path, name: str) -> bytes:
+    """Return the bytes of FOLDER/NAME, which the process wrote, and may still change.
+
+    Raises UserError for no plain file, and where the folder or what is below it is a link: to what is not its own.
+    """
+    wrong = problem(folder / name, "an image of a target", "none", "correct the method that rendered it")
+    *inner, last = Path(name).parts
+    if os.open not in os.supports_dir_fd:  # Windows, where links need a privilege
+        paths = [folder, *(folder.joinpath(*inner[: i + 1]) for i in range(len(inner))), folder / name]
+        if any(path.is_symlink() for path in paths) or not paths[-1].is_file():
+            raise wrong
+        return read_bytes(paths[-1], "an image")
+    with ExitStack() as opened:
+        try:
+            at: int | None = None
+            for part in (str(folder), *inner):
+                at = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=at)
+                opened.callback(os.close, at)
+            file = opened.enter_context(os.fdopen(os.open(last, _PLAIN, dir_fd=at), "rb"))
+        except OSError:
+            raise wrong from None
+        facts = os.fstat(file.fileno())
+        if not stat.S_ISREG(facts.st_mode) or facts.st_size > MOST_BYTES:
+            raise wrong
+        return file.read()
 
 
 def identity(method: Method) -> dict[str, Any]:

@@ -30,6 +30,7 @@ _RECORDINGS = {
     "events": ("events/{}.",),
 }
 _EXTRAS = {"flat-field": "calibration", "frames": "conventional", "events": "events"}  # of scene.json
+_MOST_COPIED = 1 << 30  # bytes of a part; a larger one has hard links, through which a fit could write
 _MODEL = "sparse/0/"  # of COLMAP; its points are true ones, which few methods are given
 _SOURCE = ("kind", "world", "variant", "profile", "seconds", "versions")  # of its source; never the seed
 NAMELESS = "scene"  # the id of a part that does not say which scene it is of
@@ -105,8 +106,12 @@ def _description(
 def _write(scene: Scene, folder: Path, description: SceneDescription, names: list[str]) -> Scene:
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
-    for name in names:
-        _take(scene.manifest.path(name), part / name)
+    sources = {name: scene.manifest.path(name) for name in names}
+    take = _copy if sum(source.stat().st_size for source in sources.values()) < _MOST_COPIED else _link
+    for name, source in sources.items():
+        with writing(part / name):
+            (part / name).parent.mkdir(parents=True, exist_ok=True)
+            take(source, part / name)
     known = replace(scene.manifest, files={name: scene.manifest.files[name] for name in names})
     finish_scene(part, description, known)
     shutil.rmtree(folder, ignore_errors=True)
@@ -114,11 +119,13 @@ def _write(scene: Scene, folder: Path, description: SceneDescription, names: lis
     return open_scene(folder, allow_gaps=True)
 
 
-def _take(source: Path, target: Path) -> None:
+def _copy(source: Path, target: Path) -> None:
+    shutil.copyfile(source, target)
+
+
+def _link(source: Path, target: Path) -> None:
     """Make `target` a further name of a file, or a copy where the file system has no such links."""
-    with writing(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.link(source.resolve(), target)  # never a symbolic link: it says where the scene lies
-        except OSError:
-            shutil.copyfile(source, target)
+    try:
+        os.link(source.resolve(), target)  # never a symbolic link: it says where the scene lies
+    except OSError:
+        shutil.copyfile(source, target)

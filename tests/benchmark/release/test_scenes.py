@@ -78,6 +78,19 @@ def test_a_release_whose_truth_was_exchanged_is_refused(tmp_path: Path) -> None:
         fetch(str(tmp_path / "release"), tmp_path / "out")
 
 
+def test_a_release_whose_stream_is_not_the_manifests_is_refused(tmp_path: Path) -> None:
+    scene = open_scene(write_small_scene(tmp_path / "pattern-1"))
+    stream = scene.root / "spikes/cam_00.dat"
+    stream.write_bytes(bytes(stream.stat().st_size))
+    scene.manifest.files["spikes/cam_00.dat"] = (
+        stream.stat().st_size,
+        sha256_file(stream),
+    )  # for the shard's list alone
+    pack([scene], tmp_path / "release", "1", 6_000_000)
+    with pytest.raises(UserError, match=r"spikes/cam_00\.dat: expected the file of manifest\.json, found another one"):
+        fetch(str(tmp_path / "release"), tmp_path / "out")
+
+
 def test_a_window_has_the_scenes_dead_ticks(tmp_path: Path) -> None:
     root = write_small_scene(tmp_path / "pattern-1")
     edit_json(root / "scene.json", lambda meta: meta["sensor"].update(dead_ticks=0.5))

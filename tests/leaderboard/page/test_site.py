@@ -81,6 +81,16 @@ def test_a_folder_with_anything_else_is_left_alone(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.rglob("*")] == ["data", "car", "scene.json"]
 
 
+def test_a_linked_folder_is_somebody_elses(tmp_path: Path) -> None:
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious/notes.txt").write_text("mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/data").symlink_to(tmp_path / "precious")
+    with pytest.raises(UserError, match="a new or empty folder, or an earlier page, found something else"):
+        write_site(tmp_path / "out", [])
+    assert [path.name for path in (tmp_path / "precious").iterdir()] == ["notes.txt"]
+
+
 def test_no_cell_is_a_formula_of_a_spreadsheet(tmp_path: Path) -> None:
     device, error = "=HYPERLINK(1)", "-2+3"
     cells = {"s": cell({"psnr": np.full(2, -1.5)}, device=device), "t": failed(error)}

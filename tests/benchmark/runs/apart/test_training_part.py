@@ -11,6 +11,7 @@ from changes import files_in
 from release_scenes import write_release_scenes
 
 from spike4dgs.benchmark.method import GIVEN
+from spike4dgs.benchmark.runs.apart import training_part
 from spike4dgs.benchmark.runs.apart.training_part import write_nameless_part
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 
@@ -36,7 +37,7 @@ def test_recordings_are_those_that_the_method_is_given(scene: Scene, tmp_path: P
             assert mine.packed.tobytes() == whole.packed.tobytes()
         assert [r is not None for r in found.recordings] == [bool(expected - streams)] * 3
         for camera in part.train:
-            assert os.path.samefile(part.root / f"spikes/{camera}.dat", scene.root / f"spikes/{camera}.dat")
+            assert (part.root / f"spikes/{camera}.dat").stat().st_nlink == 1, "a fit cannot write into the scene"
 
 
 def test_points_are_there_for_those_that_are_given_points(scene: Scene, tmp_path: Path) -> None:
@@ -55,7 +56,10 @@ def test_disks_without_links_get_copies(scene: Scene, tmp_path: Path, monkeypatc
     def refuse(*args: Any, **kwargs: Any) -> None:
         raise OSError("no links here")
 
-    linked = files_in(write_nameless_part(scene, tmp_path / "linked", GIVEN).root)
+    monkeypatch.setattr(training_part, "_MOST_COPIED", 0)
+    part = write_nameless_part(scene, tmp_path / "linked", GIVEN)
+    assert os.path.samefile(part.root / "spikes/cam_00.dat", scene.root / "spikes/cam_00.dat")
+    linked = files_in(part.root)
     monkeypatch.setattr(os, "link", refuse)
     part = write_nameless_part(scene, tmp_path / "copied", GIVEN)
     assert files_in(part.root) == linked
