@@ -33,8 +33,8 @@ def add(board: Path, name: str) -> Path:
     entry = copy.deepcopy(json.loads(path.read_text(encoding="utf-8")))
     entry["record"]["method"]["name"] = name
     del entry[KEY]  # its sheet stays where it is
-    write_json(board / (own := entry_path(entry["record"])), entry)
-    add_line(board, sha256_json(entry), own)
+    add_line(board, sha256_json(entry), own := entry_path(entry["record"]))
+    write_json(board / own, entry)
     return board / own
 
 
