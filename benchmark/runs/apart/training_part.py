@@ -107,20 +107,19 @@ def _write(scene: Scene, folder: Path, description: SceneDescription, names: lis
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     sources = {name: scene.manifest.path(name) for name in names}
-    take = _copy if sum(source.stat().st_size for source in sources.values()) < _MOST_COPIED else _link
+    copied = sum(source.stat().st_size for source in sources.values()) < _MOST_COPIED
     for name, source in sources.items():
         with writing(part / name):
             (part / name).parent.mkdir(parents=True, exist_ok=True)
-            take(source, part / name)
+            if copied:
+                shutil.copyfile(source, part / name)
+            else:
+                _link(source, part / name)
     known = replace(scene.manifest, files={name: scene.manifest.files[name] for name in names})
     finish_scene(part, description, known)
     shutil.rmtree(folder, ignore_errors=True)
     part.rename(folder)
     return open_scene(folder, allow_gaps=True)
-
-
-def _copy(source: Path, target: Path) -> None:
-    shutil.copyfile(source, target)
 
 
 def _link(source: Path, target: Path) -> None:
