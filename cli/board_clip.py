@@ -38,7 +38,7 @@ def board_clip(
         height: Rows of the cameras.
         columns: Inner corners of the board from left to right.
         rows: Inner corners from top to bottom; one of the two numbers must be odd, the other even.
-        square_m: Side of a square in metres; if left out, 0.04, or more if the array needs a larger board.
+        square_m: Side of a square in metres; if left out, 0.04, or another size that every camera sees whole.
         seed: Seed of the array's mounting errors and of the sensors.
         like: A scene folder whose array films the board, instead of nine cameras of --width and --height.
     """

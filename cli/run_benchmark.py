@@ -121,7 +121,7 @@ class EntryChoice:
 
     Args:
         leaderboard: Leaderboard folder to submit to; OUT/leaderboard if left out.
-        replace: Replace entries of the same name in that leaderboard.
+        replace: Replace entries of the same name in that leaderboard, unless they are verified better.
     """
 
     leaderboard: Path | None = None

@@ -41,7 +41,7 @@ def submit(
         scenes: Scene folders of the record's dataset.
         leaderboard: Leaderboard folder.
         refit: Fit the method again, with the record's seed, budget and device, and compare the scores.
-        replace: Replace another record of the same method and seed.
+        replace: Replace another record of the same method and seed, unless that one is verified better.
         allow_gaps: Accept recordings with gaps.
         container: Command that starts the process of the second fit, such as one with bwrap or docker; {work} and
             {part} stand for the folders that the process needs.

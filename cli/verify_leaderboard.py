@@ -16,7 +16,7 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.cli.submit import second_renderings_of
 from spike4dgs.leaderboard.submit import fit_again, refits_of
 from spike4dgs.leaderboard.tracks import current_release
-from spike4dgs.leaderboard.verify import verify_leaderboard as check
+from spike4dgs.leaderboard.verify_entries import verify_leaderboard as check
 
 _NEEDS = {  # what an option does nothing without
     "--predictions": ("--scenes",),
@@ -38,8 +38,10 @@ def verify_leaderboard(
     """Check that the release is the frozen one, entries and sheets are as submitted, and boards follow from them.
 
     With predictions and scenes, entries whose files are there are also scored again, and the verification that they
-    state is compared with the result. Second renderings of a target take half a minute per scene. With --refit, entries
-    that are labelled re-fitted are fitted again. Problems are listed on stderr, and the exit code is then 1.
+    state is compared with the result. If an entry's predictions are there but are not its own, a line says why they are
+    passed over. Second renderings of a target take half a minute per scene. With --refit, entries that are labelled
+    re-fitted are fitted again.
+    Problems are listed on stderr, and the exit code is then 1.
 
     Args:
         leaderboard: Leaderboard folder.
@@ -61,6 +63,8 @@ def verify_leaderboard(
         return fit_again(record, opened, refits_of(leaderboard), make_console(), Apart(container))
 
     found = check(leaderboard, predictions, scenes, allow_gaps, second_renderings_of, again if refit else None)
+    for line in found.passed_over:
+        print(f"passed over: {line}", file=sys.stderr)
     for line in found.problems:
         print(f"error: {line}", file=sys.stderr)
     again_text = f", {found.scored} scored again" if predictions is not None else ""

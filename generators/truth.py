@@ -11,6 +11,7 @@ its procedure changes in the mean is no noise, and is found by A and B of whole 
 
 from __future__ import annotations
 
+import secrets
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -243,19 +244,22 @@ def _total(rows: list[dict[str, Any]]) -> dict[str, float]:
     return {k: round(float(np.mean([r[k] for r in rows if k in r])), 5) for k in keys}
 
 
-def second_renderings(scene: Scene) -> tuple[Target, NDArray[np.float32], NDArray[np.float32]] | None:
-    """Return the middle target of the simulated held-out camera and two renderings of it, linear radiance [H, W].
+def second_renderings(
+    scene: Scene, draw: Callable[[Sequence[Target]], Target] = secrets.choice
+) -> tuple[Target, NDArray[np.float32], NDArray[np.float32]] | None:
+    """Return a target of the simulated held-out camera and two renderings of it, linear radiance [H, W].
 
-    Each has the noise of ground truth. None for a scene that no world of this installation made, and
-    for a split whose held-out cameras have no target of that camera. Raises UserError where one is not finite.
+    `draw` takes one of the targets at which there is light: nobody knows beforehand which image will be checked. Each
+    rendering has the noise of ground truth. None for a scene that no world of this installation made, and for a split
+    whose held-out cameras have no such target. Raises UserError where one is not finite.
     """
     job = recorded_job(scene.meta["source"])
     if job is None:
         return None
     camera = cameras_of(job)[held_out_view(job)]
-    if not (targets := [t for t in scene.targets if t.camera == camera.id]):
+    if not (targets := [t for t in scene.targets if t.camera == camera.id and job.light_at(t.tick) > 0]):
         return None
-    target, images = targets[len(targets) // 2], []
+    target, images = draw(targets), []
     print(f"rendering a target of {scene.id} twice more, to know its noise: about half a minute", file=sys.stderr)
     for seed in _SECOND_SEEDS:
         rendered, name = second_truth(job, held_out_view(job), job.seed + seed), f"{scene.id}, {target.name}"

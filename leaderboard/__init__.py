@@ -9,7 +9,8 @@ if TYPE_CHECKING:
     from spike4dgs.leaderboard.reading import read_entries
     from spike4dgs.leaderboard.submit import submit_all
     from spike4dgs.leaderboard.tracks import current_release, place_of
-    from spike4dgs.leaderboard.verify import verify_leaderboard, verify_record
+    from spike4dgs.leaderboard.verify import verify_record
+    from spike4dgs.leaderboard.verify_entries import verify_leaderboard
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -18,7 +19,8 @@ else:
             "reading": ("read_entries",),
             "submit": ("submit_all",),
             "tracks": ("current_release", "place_of"),
-            "verify": ("verify_leaderboard", "verify_record"),
+            "verify": ("verify_record",),
+            "verify_entries": ("verify_leaderboard",),
         },
     )
 

@@ -36,7 +36,7 @@ _WINDOW = 3  # px of the high-pass: texture that predictions blur is left out, M
 
 @dataclass(frozen=True)
 class TruthCheck:
-    """The predictions of a scene beside its truth; without second renderings the last three are None."""
+    """The predictions of a scene beside its truth; without second renderings the last four are None."""
 
     images: int
     equal_images: int  # with more than `MAX_EQUAL_PIXELS` equal ones
@@ -44,6 +44,7 @@ class TruthCheck:
     noise_share: float | None = None
     noise_share_error: float | None = None  # standard error
     ceiling_db: float | None = None
+    target: str | None = None  # that was rendered again
 
 
 def no_renderings(scene: Scene) -> None:
@@ -66,7 +67,7 @@ def check_truth(predictions: Predictions, scene: Scene, second_renderings: Secon
     truth, image = scene.ground_truth(target), predictions.read(target)
     share, error = noise_share(image, truth, first, second)
     noise = noise_ceiling_db(truth, first, second)
-    return TruthCheck(found.images, equal_images, found.equal_pixels, share, error, noise)
+    return TruthCheck(found.images, equal_images, found.equal_pixels, share, error, noise, target.name)
 
 
 def truth_flags(check: Mapping[str, Any]) -> Iterator[str]:

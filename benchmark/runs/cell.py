@@ -142,8 +142,8 @@ def failure_of(error: Exception) -> Failure:
         return error.failure
     if isinstance(error, WeightsError):
         return Failure("skipped", error.reason, traceback.format_exc())  # records travel: no paths of this machine
-    reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-    return Failure("failed", reason, traceback.format_exc())
+    said = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}", traceback.format_exc()
+    return Failure("failed", *(text.encode(errors="backslashreplace").decode() for text in said))  # may name any file
 
 
 def run_job(

@@ -73,6 +73,19 @@ def test_second_renderings_show_the_truths_noise(tiny_data: Path) -> None:
     assert share == pytest.approx(1, abs=0.02) and error is not None and error < 0.02
 
 
+def test_any_target_with_light_is_rendered_again(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A truth that is copied into all images but the middle one does not stay hidden."""
+    scene = open_scene(tiny_data / "car-0-tiny")
+    image = scene.ground_truth(scene.targets[0])
+    monkeypatch.setattr(renderings, "second_truth", lambda *_: lambda _: image)
+    drawn = {found[0] for _ in range(60) if (found := second_renderings(scene))}
+    assert len(drawn) > 1 and drawn <= set(scene.targets)
+    monkeypatch.setattr(Job, "light_at", lambda _, tick: float(tick == scene.targets[-1].tick))
+    assert second_renderings(scene, lambda targets: targets[0])[0] == scene.targets[-1]
+    monkeypatch.setattr(Job, "light_at", lambda *_: 0.0)
+    assert second_renderings(scene) is None
+
+
 def test_a_second_rendering_with_a_pixel_that_is_no_number_is_refused(
     tiny_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

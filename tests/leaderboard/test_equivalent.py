@@ -21,7 +21,8 @@ from spike4dgs.leaderboard import tracks
 from spike4dgs.leaderboard.page.pictures import write_pictures
 from spike4dgs.leaderboard.page.rows import gather
 from spike4dgs.leaderboard.tracks import RELEASE, current_release, match_release, release_line, scene_name
-from spike4dgs.leaderboard.verify import verify_leaderboard, verify_record
+from spike4dgs.leaderboard.verify import verify_record
+from spike4dgs.leaderboard.verify_entries import verify_leaderboard
 
 SCENES = ("s0", "s1")
 

@@ -22,7 +22,7 @@ from spike4dgs.leaderboard.rank import make_boards, write_boards
 from spike4dgs.leaderboard.reading import FEWEST, read_all, read_briefs, read_checked
 from spike4dgs.leaderboard.thumbnails import KEY
 from spike4dgs.leaderboard.tracks import SHIPPED
-from spike4dgs.leaderboard.verify import verify_leaderboard
+from spike4dgs.leaderboard.verify_entries import verify_leaderboard
 
 FOLDERS = ("entries", "local", "archive")
 

@@ -22,7 +22,7 @@ from spike4dgs.benchmark.reports.panels import Box
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_mask
 from spike4dgs.leaderboard import entry, thumbnails
 from spike4dgs.leaderboard.thumbnails import read_sheet, sheet_path
-from spike4dgs.leaderboard.verify import verify_leaderboard
+from spike4dgs.leaderboard.verify_entries import verify_leaderboard
 
 MIDDLE, WIDTH, HEIGHT = "cam_03/000040", 40, 24
 

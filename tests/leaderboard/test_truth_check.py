@@ -132,6 +132,7 @@ def test_the_truth_is_flagged_and_honest_methods_are_not(done: Path, monkeypatch
     for check in entry["verification"]["truth"].values():
         assert check["noise_share"] == pytest.approx(1, abs=0.1)
         assert check["ceiling_db"] == pytest.approx(48, abs=0.6)
+        assert check["target"] == open_scene(done / "s0").targets[0].name
 
 
 def test_without_second_renderings_the_releases_ceilings_hold(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:

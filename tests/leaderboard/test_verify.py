@@ -23,7 +23,7 @@ from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.weights import METAIQA, VARIABLE
 from spike4dgs.cli.score import score
 from spike4dgs.cli.verify_leaderboard import verify_leaderboard
-from spike4dgs.leaderboard import tracks, verify
+from spike4dgs.leaderboard import tracks, verify, verify_entries
 from spike4dgs.leaderboard.truth_check import TruthCheck, check_truth
 
 
@@ -167,18 +167,31 @@ def test_what_submit_writes_has_no_problems(done: Path, released: None, said: An
 
 
 def test_entries_of_other_seeds_and_other_scenes_of_the_same_names_are_passed_over(entered: Path, said: Any) -> None:
-    """They are honest, and what was given is not theirs."""
+    """They are honest, and what was given is not theirs: a line says why."""
     record = entered / "out/results/tfp+4dgs.json"
     forged = json.loads(record.read_text())
     for name, change in (
         ("seed", lambda: forged["method"].update(seed=1)),
         ("scene", lambda: forged["dataset"]["scenes"].update({"pattern-0": "0" * 64})),
     ):
+        forged["method"]["seed"] = 0
         change()
         (entered / f"{name}.json").write_text(json.dumps(forged))
         assert submit(entered / f"{name}.json", leaderboard=entered / "board") == 0
+    said()
     assert verify_leaderboard(entered / "board", **files_of(entered)) == 0
-    assert "3 entries, 1 scored again" in said()
+    lines = said()
+    assert "3 entries, 1 scored again" in lines
+    assert "tfp+4dgs@seed-1.json: predictions of seed 0, the entry has 1" in lines
+    assert lines.count("passed over: ") == 2 and "tfp+4dgs.json: other revisions of pattern-0" in lines
+    some = {**files_of(entered), "scenes": files_of(entered)["scenes"][:1]}
+    assert verify_leaderboard(entered / "board", **some) == 1, "nothing was scored"
+    lines = said()
+    assert "tfp+4dgs.json: pattern-1 not among --scenes" in lines
+    assert "expected predictions METHOD/SCENE of an entry, and its scenes, found none" in lines
+    shutil.rmtree(entered / "out/predictions/tfp+4dgs/pattern-1")
+    verify_leaderboard(entered / "board", **files_of(entered))
+    assert "tfp+4dgs.json: no predictions of pattern-1" in said()
 
 
 @pytest.mark.parametrize(
@@ -271,11 +284,12 @@ def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.Mon
             return replace(check_truth(*args), noise_share=share, noise_share_error=0.01, ceiling_db=60.0)
 
         monkeypatch.setattr(verify, "check_truth", measured)
-        return verify.verify_leaderboard(entered / "board", **files_of(entered)).problems
+        return verify_entries.verify_leaderboard(entered / "board", **files_of(entered)).problems
 
     assert not check(0.001)
-    assert len(check(0.5)) == 2 and "expected noise_share 0.5, as computed again, found 0.0" in check(0.5)[1]
-    assert "expected the flags carries the truth's noise (pattern-0, pattern-1)" in check(0.5)[0], "rough states none"
+    found = check(0.5)
+    assert len(found) == 2, "rough states none, tfp+4dgs another share"
+    assert all("expected the flags carries the truth's noise (pattern-0, pattern-1)" in line for line in found)
 
 
 def test_a_label_that_a_second_fit_does_not_bear_out_is_found(

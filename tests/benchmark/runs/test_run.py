@@ -224,6 +224,7 @@ def test_a_fit_gets_only_the_training_views(small_scene: Path, tmp_path: Path) -
     [
         (ValueError("no luck"), "ValueError: no luck"),
         (MemoryError(), "MemoryError"),
+        (ValueError("of \udcff.exr"), r"ValueError: of \udcff.exr"),  # the name of a file that is no UTF-8
         (UserError("scene: expected light, found none; add some"), "scene: expected light, found none; add some"),
         (np.zeros((3, 4), np.float32), "expected a floating-point array of shape (24, 40), found float32 (3, 4)"),
         (np.zeros((24, 40), np.uint8), "found uint8 (24, 40)"),
