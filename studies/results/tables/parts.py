@@ -1,4 +1,4 @@
-"""Tables of `spike4dgs-x` alone: each of the nine scenes, and each part switched off on development scenes."""
+"""Tables of `spike4dgs-x` alone: the nine scenes, with a calibration and without, and its parts switched off."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
 
 DEVELOPMENT = ("van-10-small", "motor-10-small", "turntable-10-small")
-WHOLE = "spike4dgs-x"
+WHOLE, SELF_CALIBRATED = "spike4dgs-x", "spike4dgs-x+self-calibrated"
 SWITCHES = {  # what is switched off -> the settings that do it
     "calibration": "images.flat_field=false,initialization.flat_field=false,initialization.noise=0.0004",
     "points from images with hardly any noise": "initialization.noise=0.0004",
@@ -59,6 +59,23 @@ def own_scenes_block(records: Sequence[Record]) -> list[str]:
         texts = [metric_text(row.mean(metric), digits) for metric, digits in _METRICS.values()]
         lines.append(["**mean**" if len(scenes) > 1 else scenes[0].partition("-")[0], *texts])
     return [*markdown(("scene", *_METRICS), lines), "", f"`{WHOLE}`, means over seeds.", "", provenance(own, _OWN)]
+
+
+def self_calibrated_block(records: Sequence[Record]) -> list[str]:
+    """Return the lines of a table of the nine scenes, and of their mean: what the missing flat fields cost."""
+    names = (WHOLE, SELF_CALIBRATED)
+    group = replace(NINE, rows=tuple(row for row in NINE.rows if row.name in names))
+    own = of_group(group, records)
+    if {r["row"] for r in own} != {*names}:
+        return [NOTHING]
+    lines = []
+    for scenes in (*((scene,) for scene in NINE.scenes), NINE.scenes):
+        given, without = rows_of(names, scenes, own)
+        title = "**mean**" if len(scenes) > 1 else scenes[0].partition("-")[0]
+        lines.append([title, both_text(given), both_text(without), change_text(without, given)])
+    legend = "PSNR of the whole image / where things move, dB; means over seeds."
+    table = markdown(("scene", *(f"`{name}`" for name in names), "change"), lines)
+    return [*table, "", legend_of(legend, lines), "", provenance(own, group)]
 
 
 def parts_block(records: Sequence[Record]) -> list[str]:

@@ -31,7 +31,7 @@ from spike4dgs.studies.results.tables.images import TABLE6, images_block
 from spike4dgs.studies.results.tables.modality import GROUP as ON_SENSORS
 from spike4dgs.studies.results.tables.modality import NOISY, modality_block, noisy_block, plot_modality
 from spike4dgs.studies.results.tables.parts import GROUP as PARTS
-from spike4dgs.studies.results.tables.parts import SWITCHES, own_scenes_block, parts_block
+from spike4dgs.studies.results.tables.parts import SWITCHES, own_scenes_block, parts_block, self_calibrated_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 from spike4dgs.studies.results.tables.realistic import GROUP as TRACK_SMALL
 from spike4dgs.studies.results.tables.realistic import cameras_block, realistic_block
@@ -52,6 +52,7 @@ SHOWN = {  # a block -> two rows that it has, if not those of the tables
     "covisible": ("spike4dgs-x", "tfp+stg"),
     "own-scenes": ("spike4dgs-x",),
     "realistic": ("spike4dgs-x", "tfp+stg"),
+    "self-calibrated": ("spike4dgs-x", "spike4dgs-x+self-calibrated"),
     "parts": ("spike4dgs-x",),
 }
 SCENES = ("bricks-0-small", "chips-0-small", "turntable-0-small", "bird-0-small")
@@ -519,6 +520,17 @@ def test_what_ours_reaches_on_each_scene_and_in_the_mean():
     assert lines[2] == "| jaywalk | 32.00 | 0.9700 | 30.00 | 0.9600 | 0.050 | - |"
     assert lines[11] == "| **mean** | 36.00 | 0.9700 | 34.00 | 0.9600 | 0.050 | - |"
     assert "18 of 27 planned cells" in lines[-1]
+
+
+def test_what_the_missing_flat_fields_cost_on_each_scene_and_in_the_mean():
+    scenes, without = blocks.NINE.scenes, "spike4dgs-x+self-calibrated"
+    found = [record(OURS, scene, 30.0 + k, seed) for k, scene in enumerate(scenes) for seed in (0, 1)]
+    assert self_calibrated_block(found) == [blocks.NOTHING]
+    found += [record(without, scene, 29.0 + k / 2) for k, scene in enumerate(scenes)]
+    lines = self_calibrated_block(found)
+    assert lines[2] == "| jaywalk | 32.00 / 30.00 | 31.00 / 29.00 | -1.00 / -1.00 |"
+    assert lines[11] == "| **mean** | 36.00 / 34.00 | 33.00 / 31.00 | -3.00 / -3.00 |"
+    assert "27 of 54 planned cells" in lines[-1]
 
 
 def test_the_realistic_cameras_table_is_of_the_scenes_that_were_measured():
