@@ -12,7 +12,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -213,9 +213,12 @@ def locked(
     try:
         yield
     finally:
-        if temporary:
+        if temporary and os.name != "nt":  # while it is held: later it may be another's
             file.unlink(missing_ok=True)
         lock.release()
+        if temporary and os.name == "nt":  # where no open file can be removed
+            with suppress(PermissionError):
+                file.unlink(missing_ok=True)
 
 
 def _check_lock(file: Path) -> None:

@@ -89,9 +89,15 @@ def export_nerfstudio(
     def from_spikes(target: Target) -> Float32:
         return IMAGES[images](filled[target.camera], [target.tick], opened.radiance_gain)[0]
 
-    frames = {"test": [_write(out, "test", opened, target, truth(target)) for target in opened.targets]}
-    for name, times in (("train", ticks), ("val", between)):
-        targets = [Target(camera, tick) for camera in opened.train for tick in times if seen[camera][tick]]
+    parts = {
+        name: [Target(camera, tick) for camera in opened.train for tick in times if seen[camera][tick]]
+        for name, times in (("train", ticks), ("val", between))
+    }
+    for target in parts["train"][:1]:
+        from_spikes(target)  # a maker that lacks something says so before anything is written
+    tests = [target for target in opened.targets if f"images/{target.name}.exr" in opened.manifest.files]
+    frames = {"test": [_write(out, "test", opened, target, truth(target)) for target in tests]}
+    for name, targets in parts.items():
         frames[name] = [_write(out, name, opened, target, from_spikes(target)) for target in targets]
     for name, of_part in frames.items():  # after all images: what is cut off has no description
         path = out / f"transforms_{name}.json"

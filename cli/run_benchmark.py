@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.method import (
     DEFAULT_BUDGET,
     Method,
@@ -39,7 +39,7 @@ from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.record import Record, of_scenes
 from spike4dgs.benchmark.runs.refinement import SUFFIX
 from spike4dgs.benchmark.runs.run import Settings
-from spike4dgs.benchmark.scene.scene import open_scenes
+from spike4dgs.benchmark.scene.scene import open_scene, open_scenes
 from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
 from spike4dgs.leaderboard.reading import typical_fit_seconds
@@ -225,7 +225,7 @@ def _finish(runs: Sequence[SplitRun], scenes: tuple[Path, ...], allow_gaps: bool
         folders = {out / "results" / f"{name}.json": out / "predictions" / name for out, name in names}
         refused += submit_all(
             {result: folder if folder.is_dir() else None for result, folder in folders.items()},
-            scenes=_with_neighbours(scenes, run),
+            scenes=_with_neighbours(scenes, run, allow_gaps),
             leaderboard=entries.leaderboard or run.settings.out / "leaderboard",
             replace=entries.replace or entries.leaderboard is None,
             allow_gaps=allow_gaps,
@@ -243,11 +243,20 @@ def _finish(runs: Sequence[SplitRun], scenes: tuple[Path, ...], allow_gaps: bool
     return 1 if failed or refused else 0
 
 
-def _with_neighbours(scenes: tuple[Path, ...], run: SplitRun) -> tuple[Path, ...]:
-    """Return scene folders and, of the scenes that records keep of earlier runs, those that lie beside them."""
-    kept = dict.fromkeys(scene for record in run.records for scene in record["scenes"])
-    missing = [scenes[0].parent / scene for scene in kept if scene not in {s.id for s in run.scenes}]
-    return (*scenes, *(path for path in missing if path.is_dir()))
+def _with_neighbours(scenes: tuple[Path, ...], run: SplitRun, allow_gaps: bool) -> tuple[Path, ...]:
+    """Return scene folders and, of the scenes that records keep of earlier runs, those that lie unchanged beside."""
+    given = {s.id for s in run.scenes}
+    of_all = [(scene, r["dataset"]) for r in run.records for scene in r["scenes"] if scene not in given]
+    kept = {(scene, of["scenes"][scene], of["split"]) for scene, of in of_all}
+    found = {scenes[0].parent / kept_one[0] for kept_one in kept if _is_there(scenes[0].parent, *kept_one, allow_gaps)}
+    return (*scenes, *sorted(found))
+
+
+def _is_there(data: Path, scene: str, revision: str, split: str, allow_gaps: bool) -> bool:
+    try:
+        return open_scene(data / scene, allow_gaps, split).revision == revision
+    except UserError:
+        return False
 
 
 def plain_name(record: Record) -> str:

@@ -132,8 +132,8 @@ def _scenes_of(
     if others := {read_info(folder / scene).method.seed for scene in ok} - {seed}:
         return [], f"predictions of seed {', '.join(map(str, others))}, the entry has {seed}"
     opened = open_scenes([scenes[scene] for scene in ok], allow_gaps, record["dataset"]["split"])
-    if others := [s.id for s in opened if s.revision not in revisions_of(s.id, record["dataset"])]:
-        return [], f"other revisions of {', '.join(others)}"
+    if changed := [s.id for s in opened if s.revision not in revisions_of(s.id, record["dataset"])]:
+        return [], f"other revisions of {', '.join(changed)}"
     return opened, ""
 
 

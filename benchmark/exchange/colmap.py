@@ -84,20 +84,28 @@ def _binary_poses(data: bytes) -> bytes:
 
 def _text_poses(data: bytes) -> bytes:
     """Return the text of images.txt without the images' points: of every two lines the second is empty."""
-    lines = [line for line in data.decode().split("\n") if not line.startswith("#")]  # ValueError for other bytes
-    return "".join(line + "\n\n" for line in lines[::2] if line.strip()).encode()
+    lines, poses = iter(data.decode().split("\n")), []  # ValueError for other bytes
+    for line in lines:
+        if line.strip() and not line.lstrip().startswith("#"):
+            poses.append(line.strip() + "\n\n")
+            next(lines, None)  # the image's points
+    return "".join(poses).encode()
 
 
 def _stream_of(image: str, names: Collection[str]) -> str:
     """Return the stream of an image; where there is none, the image's folder, or its name without suffix."""
     path = PurePosixPath(image)
-    candidates = (image, (path.parent / path.stem).as_posix(), path.stem, *path.parts[:1])
+    candidates = (image, (path.parent / path.stem).as_posix(), *path.parts[:1], path.stem)
     other = path.parts[0] if len(path.parts) > 1 else path.stem
     return next((name for name in candidates if name in names), other)
 
 
 def _camera(name: str, image: Any, camera: Any, folder: Path) -> FoundCamera:
-    K, pose = camera.calibration_matrix(), image.cam_from_world()
+    try:
+        K, pose = camera.calibration_matrix(), image.cam_from_world()
+    except ValueError:
+        fix = "calibrate it with a model that has a focal length"
+        raise problem(folder, f"a perspective camera of {name}", camera.model.name, fix) from None
     intrinsics = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     size = camera.width, camera.height
     made = make_camera(name, size, intrinsics, pose.rotation.matrix(), pose.translation, folder)

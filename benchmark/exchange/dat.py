@@ -12,6 +12,7 @@ from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.camera_files import read_camera_files
 from spike4dgs.benchmark.exchange.recording import Recording, Source, write_recording
+from spike4dgs.benchmark.spikes.folder import NAME as STREAM_FOLDER
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream
 from spike4dgs.benchmark.untrusted import MAX_SIDE, check_ids
 
@@ -42,6 +43,10 @@ def _dat_files(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise problem(path, "a .dat file or a folder of them", "no such file", "check the path")
+    if (path / STREAM_FOLDER).is_file():
+        expected, found_text = "bare .dat files", f"a recording that {STREAM_FOLDER} describes, with its rate and gaps"
+        fix = "use the folder as it is, as by inspect, calibrate-rig and fit, or copy its .dat files elsewhere"
+        raise problem(path, expected, found_text, fix)
     if not (found := sorted(path.glob("*.dat"))):
         raise problem(path, "a folder with .dat files, one for each camera", "none", "check the path")
     return found

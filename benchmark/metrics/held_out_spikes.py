@@ -188,7 +188,8 @@ class SpikeView:
             return None
         response = self.recorded.response
         intervals = np.maximum(spans.intervals, 1).astype(np.float64)
-        shortest = np.floor(intervals / response.rate(np.ones_like(response.dark)))  # under white
+        white = response.rate(np.ones_like(response.dark))
+        shortest = np.floor(intervals / np.where(white > 0, white, 1.0))  # under white; a dead pixel's is not used
         ticks = np.maximum(np.maximum(spans.last - spans.first, 1), shortest)
         own = intervals / ticks
         best = own if self.true_spanned is None else response.rate(self.true_spanned)

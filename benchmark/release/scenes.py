@@ -81,7 +81,8 @@ def download(source: Source, release: Release, selection: Selection, out: Path, 
 
 def _held_bytes(root: Path) -> int:
     """Return the room that files below a folder take; of a part with holes, without them."""
-    return sum(path.stat().st_blocks * 512 for path in root.rglob("*") if path.is_file())
+    stats = [path.stat() for path in root.rglob("*") if path.is_file()]
+    return sum(s.st_blocks * 512 if hasattr(s, "st_blocks") else s.st_size for s in stats)  # Windows has no blocks
 
 
 def _check_room(out: Path, needed: int) -> None:
@@ -168,7 +169,8 @@ class _Download:
                 w.path.unlink(missing_ok=True)
             write_json(started, {"excerpt": excerpt})
         whole = [w for w in wanted if _is_window(w.path, cut[1] - cut[0], hashes)]
-        known = {w.path.stem: hashes[w.path.stem] for w in whole if w.path.stem in hashes}
+        fetched = {w.path.stem for w in wanted if w not in whole}
+        known = {camera: sha256 for camera, sha256 in hashes.items() if camera not in fetched}
         for w in whole:
             w.part.unlink(missing_ok=True)
         transfer(self.source, [w for w in wanted if w not in whole], self.progress, self.workers)

@@ -107,12 +107,13 @@ class _File:
         wanted = self.wanted
         with writing(wanted.path):
             wanted.path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(wanted.part, os.O_RDWR | os.O_CREAT, 0o666)
+            # Windows would translate line ends, and has no `pwrite`.
+            descriptor = os.open(wanted.part, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
             try:
-                position, view = (number - wanted.blocks.start) * BLOCK, memoryview(data)
+                os.lseek(descriptor, (number - wanted.blocks.start) * BLOCK, os.SEEK_SET)
+                view = memoryview(data)
                 while view:  # a system may write less than it is given, as where a disk is about to be full
-                    written = os.pwrite(descriptor, view, position)
-                    position, view = position + written, view[written:]
+                    view = view[os.write(descriptor, view) :]
             finally:
                 os.close(descriptor)
         with self._lock:

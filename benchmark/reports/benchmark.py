@@ -50,9 +50,9 @@ def run_split(
     every = [*earlier, *records]
     _say(console, *lines)
     print_results(console, every, columns)
-    _say(console, *_write_images(scenes, of_one_seed(every), settings))
     write_results(out / "results.csv", every)
     write_results_table(out, every)
+    _say(console, *_write_images(scenes, of_one_seed(every), settings))
     _say(console, f"images: {out}/sheet_*.png and {out}/scatter.png; values: {out}/results.csv")
     _say(console, f"for papers and slides: the same as .pdf, {out}/table.md, table.tex and sheet_*.mp4")
     return SplitRun(scenes, settings, records, earlier)

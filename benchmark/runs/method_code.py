@@ -76,4 +76,5 @@ def _files(module: ModuleType) -> Iterator[tuple[str, Path]]:
             if count >= _MOST_FILES:
                 fix = "move the method into a package of its own"
                 raise problem(root, f"a method's package of at most {_MOST_FILES} files", "more", fix)
-            yield path.relative_to(root).as_posix(), path
+            if path.is_file() and not path.name.startswith("."):  # editors keep links of locks
+                yield path.relative_to(root).as_posix(), path

@@ -102,18 +102,24 @@ def missing_cell(status: str, error: str) -> Cell:
     }
 
 
+def check_scenes(scenes: Sequence[Scene]) -> None:
+    """Raise UserError unless scenes can be of one record: each given once, all with one split."""
+    if len({s.id for s in scenes}) < len(scenes):
+        raise problem("scenes", "distinct scenes", ", ".join(s.id for s in scenes), "give each scene once")
+    if len(splits := {s.split for s in scenes}) > 1:
+        raise problem("scenes", "one split", ", ".join(sorted(splits)), "score scenes of one dataset together")
+
+
 def build_record(method: MethodInfo, scenes: Sequence[Scene], cells: Mapping[str, Cell], device: str) -> Record:
     """Put the cells (by scene id) of a method together. `device` is where this process computes."""
-    splits = {s.split for s in scenes}
-    if len(splits) > 1:
-        raise problem("scenes", "one split", ", ".join(sorted(splits)), "score scenes of one dataset together")
+    check_scenes(scenes)
     record = {
         "schema": SCHEMA,
         "method": method.as_dict(),
         "dataset": {
             "name": "+".join(sorted(s.id for s in scenes)),
             "scenes": {s.id: s.revision for s in scenes},
-            "split": splits.pop(),
+            "split": scenes[0].split,
         },
         "sensors": {s.id: sensor for s in scenes if (sensor := sensor_of(s.meta))},
         "protocol": PROTOCOL,

@@ -159,8 +159,7 @@ def _work_folder(order: Order, spare: Path) -> Iterator[Path]:
         work = spare
         if order.folder.is_here():
             with suppress(UserError, OSError):
-                held.enter_context(locked(lock, order.work, "a fit that no other worker does"))
-                held.callback(lock.unlink, missing_ok=True)
+                held.enter_context(locked(lock, order.work, "a fit that no other worker does", temporary=True))
                 work = order.work
         yield work
 

@@ -123,12 +123,14 @@ def of_one_seed(records: Sequence[Record]) -> list[Record]:
 
 
 def is_shown(record: Record, scene: Scene, folder: Path) -> bool:
-    """Return whether a sheet can show a record's cell: a missing one, or one whose predictions `folder` still holds."""
+    """Return whether a sheet can show a record's cell: a missing one, or one whose images `folder` holds undamaged."""
     cell = record["scenes"][scene.id]
     if cell["status"] != "ok":
         return True
     try:
-        return open_predictions(folder, scene.targets).sha256 == str(cell["predictions_sha256"])
+        found = open_predictions(folder, scene.targets)
+        found.verify()
+        return found.sha256 == str(cell["predictions_sha256"])
     except UserError:
         return False
 

@@ -38,6 +38,7 @@ from spike4dgs.benchmark.runs.record import (
     Record,
     build_record,
     check_method_name,
+    check_scenes,
     missing_cell,
     with_earlier_scenes,
     write_record,
@@ -137,8 +138,7 @@ def run_matrix(
     record and its traceback in a log file. Raises UserError for scenes that are damaged or given twice, before any work
     begins, and where the cluster cannot go on.
     """
-    if len({s.id for s in scenes}) < len(scenes):
-        raise problem("scenes", "distinct scenes", ", ".join(s.id for s in scenes), "give each scene once")
+    check_scenes(scenes)
     if settings.seeds < 1:
         raise problem("--seeds", "a number from 1 up", str(settings.seeds), "correct it")
     for method in methods:

@@ -16,7 +16,7 @@ from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, check_image
 from spike4dgs.benchmark.metrics.measure import Selection, fit_gain, measure, scene_means, scene_notes, select_metrics
 from spike4dgs.benchmark.runs.held_out import Cameras, has_truth, open_cameras, targets_of, view_of, without_truth
 from spike4dgs.benchmark.runs.predictions import SUMS, MethodInfo, Predictions, open_predictions
-from spike4dgs.benchmark.runs.record import Cell, Record, build_record, missing_cell
+from spike4dgs.benchmark.runs.record import Cell, Record, build_record, check_scenes, missing_cell
 from spike4dgs.benchmark.scene.scene import Scene, Target
 
 _KEPT = 16  # targets whose images stay in memory: spikes around one are compared with those near it
@@ -143,8 +143,7 @@ def score_predictions(
     root, selection = Path(root), selection or select_metrics()
     if not root.is_dir():
         raise problem(root, "a predictions folder", "no such folder", "check the path or run the method")
-    if len({s.id for s in scenes}) < len(scenes):
-        raise problem("scenes", "distinct scenes", ", ".join(s.id for s in scenes), "give each scene once")
+    check_scenes(scenes)
     cells: dict[str, Cell] = {}
     methods: dict[str, MethodInfo] = {}
     for scene_id, folder in prediction_folders(root, scenes).items():

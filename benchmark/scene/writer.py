@@ -196,7 +196,7 @@ def _colmap_lens(camera: Camera) -> tuple[str, tuple[float, ...]]:
 def colmap_distortion(camera: Any) -> Distortion | None:
     """Return the lens distortion of a pycolmap camera; None where OpenCV's five numbers do not describe it."""
     model, params = camera.model.name, [float(v) for v in camera.params]
-    if camera.is_undistorted():
+    if model in ("SIMPLE_PINHOLE", "PINHOLE"):  # an equidistant lens distorts even with coefficients of zero
         return ()
     if model in ("SIMPLE_RADIAL", "RADIAL"):
         return make_distortion(params[3:])

@@ -89,19 +89,19 @@ def flickering(stream: Recording) -> Mask:
 def from_recordings(flat: Recording, dark: Recording) -> BadPixels:
     """Return the pixels that never fire under uniform light, fire too often in the dark, or flicker in either.
 
-    A hot pixel's dark rate is at least `SENSOR.hot_factor` times the chip's median, in at least FEWEST_SPIKES spikes.
-    Raises UserError where the recordings are of two sizes, or the uniform one has too few spikes to tell.
+    A pixel is dead only where a usual one has FEWEST_SPIKES spikes. A hot pixel's dark rate is at least
+    `SENSOR.hot_factor` times the chip's median, in at least as many. Raises UserError where the recordings are of two
+    sizes, or there is no light in the uniform one.
     """
     light, dark_spikes = total_counts(flat), total_counts(dark)
     if light.shape != dark_spikes.shape:
         found = f"{flat.width}x{flat.height} and {dark.width}x{dark.height}"
         raise problem("calibration", "two recordings of one size", found, "restore them")
-    if np.median(light) < FEWEST_SPIKES:
-        expected = f"{FEWEST_SPIKES} spikes of a usual pixel"
-        raise problem(flat.source, expected, f"{np.median(light):g}", "record uniform light for longer")
+    if (usual := float(np.median(light))) < 1:
+        raise problem(flat.source, "a spike of a usual pixel", "none", "record uniform light for longer")
     hot = dark_spikes >= max(SENSOR.hot_factor * float(np.median(dark_spikes)), FEWEST_SPIKES)
     unsteady = flickering(flat) | flickering(dark)
-    return BadPixels(light == 0, hot & ~unsteady, unsteady, "recordings")
+    return BadPixels((light == 0) & (usual >= FEWEST_SPIKES), hot & ~unsteady, unsteady, "recordings")
 
 
 def isolated(rate: Float64, n_ticks: int, deviation: Float64 | None = None) -> BadPixels:

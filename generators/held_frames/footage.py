@@ -20,6 +20,7 @@ _FORMATS = ("BMP", "JPEG", "PNG", "TIFF")
 _MODES = {"1": "L", "L": "L", "P": "RGB", "RGB": "RGB", "RGBA": "RGB"}  # of 8 bits a channel -> as it is read
 _MOST_PIXELS = 1 << 26  # of a frame
 _MOST_FRAMES = 1_000_000  # of a video, whose header may state any number
+_ORIENTATION, _UPRIGHT = 0x0112, (0, 1)  # EXIF's tag; 0 says nothing
 _AGAIN = "restore or export it"
 
 
@@ -106,6 +107,11 @@ def _read(path: Path) -> UInt8:
             if deep or image.mode not in _MODES:
                 found = f"mode {image.mode}" + (", of more bits" if deep else "")
                 raise problem(path, "an image of 8 bits a channel", found, "export it with 8 bits")
+            if (count := getattr(image, "n_frames", 1)) > 1:
+                raise problem(path, "a file for each frame", f"{count} frames in one", "export them one by one")
+            if (turned := image.getexif().get(_ORIENTATION, 1)) not in _UPRIGHT:
+                fix = "export it upright, as its camera was calibrated"
+                raise problem(path, "an image that is stored upright", f"EXIF orientation {turned}", fix)
             return np.asarray(image.convert(_MODES[image.mode]))
     except UserError:
         raise

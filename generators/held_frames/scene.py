@@ -24,6 +24,7 @@ from spike4dgs.benchmark.scene.scene import Target
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
+from spike4dgs.benchmark.untrusted import check_ids
 from spike4dgs.generators.held_frames.footage import Footage, read_frames
 from spike4dgs.generators.profiles import RATE_HZ
 from spike4dgs.generators.sensor.calibration import (
@@ -94,6 +95,7 @@ def write_held_frames(
     they or the settings do not fit.
     """
     holding.check(footage)
+    check_ids([out.resolve().name], "scene", "--out", "choose another name")
     check_new(out)
     first = footage[holding.held_out]
     chosen, hold = holding.chosen(first.frames), holding.hold_ticks

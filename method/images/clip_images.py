@@ -80,7 +80,7 @@ class ClipImages:
             "height": s.height,
             "rate_hz": s.rate_hz,
             "rows_bottom_up": s.rows_bottom_up,
-            **({"gaps": "filled"} if s.gaps else {}),
+            **({"filled": [[gap.first_tick, gap.ticks] for gap in s.gaps]} if s.gaps else {}),
             **({"dead_ticks": s.dead_ticks} if s.dead_ticks else {}),
         }
 

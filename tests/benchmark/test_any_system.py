@@ -1,5 +1,6 @@
 """The package on systems other than Linux: what only Linux has is taken away, and the package is imported and used."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 
 CHILD = r"""
-import builtins, gc, importlib, io, os, pathlib, sys, traceback
+import builtins, gc, importlib, io, os, pathlib, shutil, sys, traceback
 
 gc.disable()  # thousands of modules are read, and none of them is garbage
 
@@ -23,6 +24,8 @@ def use(system):
         only_linux |= {"resource", "termios", "pwd", "grp"}
     for name in only_linux:
         sys.modules[name] = None  # an import of it is an ImportError
+    disk = shutil.disk_usage("/")  # which Windows tells in another way
+    shutil.disk_usage = lambda path: disk
     for name in dir(os):
         if name.startswith(("sched_", "posix_")) or name in ("O_DIRECT", "fdatasync", "memfd_create"):
             delattr(os, name)
@@ -63,8 +66,22 @@ def use(system):
     stream = SpikeStream(pack(spikes), 24, 20, 20_000.0)
     assert (stream.window(0, 60) == spikes).all()
     assert np.isfinite(make_image("tfp", stream, 30, 0.3)).all()
-    with locked(folder / "x.lock", "x", "free"):
-        pass
+    for temporary in (False, True):
+        with locked(folder / "x.lock", "x", "free", temporary=temporary):
+            pass
+    assert not (folder / "x.lock").exists()
+
+    from small_scenes import write_small_scene
+    from spike4dgs.benchmark import open_scene
+    from spike4dgs.benchmark.release.pack import pack
+    from spike4dgs.benchmark.release.scenes import download, open_release
+    from spike4dgs.benchmark.release.selection import Selection
+    from spike4dgs.benchmark.release.source import Source
+    pack([open_scene(write_small_scene(folder / system / "scene"))], folder / system / "release", "1", 10**9)
+    source = Source(str(folder / system / "release"))
+    for _ in range(2):
+        (scene,) = download(source, open_release(source), Selection(), folder / system / "data").folders
+    assert (scene / "manifest.json").read_bytes() == (folder / system / "scene/manifest.json").read_bytes()
     assert available_cores() >= 1 and get_threads() >= 1 and cpu_name() and environment("cpu")["cpu"]
     peak_memory_mb("cpu")
     print("imported and used", system, flush=True)
@@ -86,6 +103,7 @@ for system in ("darwin", "win32"):
 @pytest.mark.slow
 def test_without_what_only_linux_has(tmp_path: Path, pytestconfig: pytest.Config) -> None:
     command = [sys.executable, "-W", "ignore", "-c", CHILD, str(pytestconfig.rootpath), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    environment = os.environ | {"PYTHONPATH": str(pytestconfig.rootpath / "tests/support")}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     used = [f"imported and used {system}" for system in ("darwin", "win32")]
     assert done.stdout.splitlines() == used, done.stderr[-3000:]

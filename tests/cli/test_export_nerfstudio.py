@@ -16,9 +16,11 @@ from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark import Target, UserError, open_scene
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import export_spikecv, import_spikecv
+from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.cameras import to_nerfstudio
 from spike4dgs.benchmark.scene.images import write_exr
 from spike4dgs.benchmark.scene.manifest import write_manifest
+from spike4dgs.benchmark.weights import WeightsError
 from spike4dgs.cli.export_nerfstudio import export_nerfstudio
 
 
@@ -116,6 +118,23 @@ def test_images_at_missing_ticks_are_left_out_and_those_beside_no_darker(small_s
     expected = IMAGES["tfp"](filled, [20], scene.radiance_gain)[0]
     found = linear(next(f for f in frames if f.name == "cam_01_000020").rgb)
     assert np.abs(found - np.clip(expected, 0, 1)[..., None]).max() < 0.006
+
+
+def test_a_maker_that_lacks_its_weights_writes_nothing(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv("SPIKE4DGS_WEIGHTS", raising=False)
+    with pytest.raises(WeightsError):
+        export_nerfstudio(small_scene, tmp_path / "out", images="ssml")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_training_part_has_no_test_images(small_scene: Path, tmp_path: Path) -> None:
+    part = write_training_part(open_scene(small_scene), tmp_path / "part")
+    assert export_nerfstudio(part.root, tmp_path / "out") == 0
+    assert len(load(tmp_path / "out", "train")) == 4 * len(part.train)
+    assert not (tmp_path / "out/transforms_test.json").exists()
 
 
 def test_validation_images_lie_between_the_training_times(exported: Path) -> None:

@@ -176,6 +176,16 @@ def test_images_at_lost_ticks_are_absent(small_scene: Path, tmp_path: Path, caps
     assert sorted(p.stem for p in (tmp_path / "out").rglob("*.png")) == ["000000", "000020", "000060"]
 
 
+def test_images_of_a_recording_whose_gaps_were_corrected_are_not_kept(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["images", str(small_scene), "--camera", "cam_01", "--out", str(tmp_path / "out"), "--allow-gaps"]
+    add_gap(small_scene, "cam_01", 35, 10)
+    assert main(arguments) == 0
+    add_gap(small_scene, "cam_01", 35, 30)
+    assert main(arguments) == 2 and "out/cam_01" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("method", ["tfp", "tfi", "adaptive"])
 def test_images_beside_missing_ticks_are_not_darker(small_scene: Path, tmp_path: Path, method: str) -> None:
     """What a recorder lost is filled, as in a fit: zeros are no darkness."""

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from changes import edit_json
 from dummy_methods import CountMethod, FailingMethod
 from nosy_methods import PlaysBack
 from PIL import Image
@@ -21,6 +22,7 @@ from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import UserError, open_scene, plugins
 from spike4dgs.benchmark.reports import benchmark
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.cli import main
 from spike4dgs.cli import run_benchmark as command
 from spike4dgs.leaderboard.page.rows import run_records
@@ -106,9 +108,14 @@ def test_a_run_with_another_method_adds_to_what_is_there(
         assert (row["scene"], row["split"], row["status"]) == ("pattern-0", record["dataset"]["split"], "ok")
         assert float(row["psnr"]) == cell["metrics"]["psnr"] and float(row["fit_seconds"]) == cell["fit_seconds"]
         assert cell["metrics"]["niqe"] is None and row["niqe"] == ""
-    shutil.rmtree(out / "predictions/counts")
-    go("quick+counts")
-    assert height() == one and len(rows()) == 2, "a method without its predictions is in the table alone"
+    image = next(out.glob("predictions/counts/*/*/*.exr"))
+    for remove in (
+        lambda: image.write_bytes(image.read_bytes()[:50]),
+        lambda: shutil.rmtree(out / "predictions/counts"),
+    ):
+        remove()
+        go("quick+counts")
+        assert height() == one and len(rows()) == 2, "a method without its predictions is in the table alone"
     go("counts", seed=1)
     assert [(r["method"], r["seed"]) for r in rows()] == [("quick+counts", "0"), ("counts", "1")], "replaced, not twice"
 
@@ -147,6 +154,20 @@ def test_records_that_do_not_belong_there_are_left_out_and_named(
     assert "results/counts.json: other scenes, revisions or split" in text
     assert "results/damaged.json: expected a spike4dgs-result/1 record (JSON)" in text
     assert [r["method"] for r in csv.DictReader((out / "results.csv").read_text().splitlines())] == ["quick+counts"]
+
+
+@pytest.mark.usefixtures("installed", "no_images")
+def test_a_neighbour_that_no_longer_opens_refuses_no_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It was fitted with --allow-gaps, and the record keeps it."""
+    with_gaps, other = (write_small_scene(tmp_path / f"data/pattern-{k}", seed=k) for k in range(2))
+    lost = [{"camera": "cam_01", "first_tick": 30, "ticks": 2, "reason": "lost"}]
+    edit_json(with_gaps / "scene.json", lambda meta: meta.update(gaps=lost))
+    write_manifest(with_gaps)
+    go = partial(run_here, methods=("counts",), out=tmp_path / "out", device="cpu", metrics=("psnr",))
+    assert go((with_gaps,), allow_gaps=True) == 0 and go((other,)) == 0
+    assert "counts: claimed" in capsys.readouterr().out
+    assert go((other,), allow_gaps=True) == 0
+    assert "counts: re-scored" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("installed", "no_images")

@@ -145,7 +145,7 @@ def _take(job: Job, folders: Sequence[Path], model_path: Path, work: Path, child
         child.wait(DONE)
         if (work / MODEL).is_file() and not (work / MODEL).is_symlink():
             model_path.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(work / MODEL, model_path)
+            shutil.move(work / MODEL, model_path)  # a worker's own folder may lie on another disk
 
 
 class _Child:

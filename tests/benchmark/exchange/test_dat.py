@@ -124,6 +124,35 @@ def test_colmap_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
             assert np.abs(found - expected).max() < 1e-6
 
 
+def test_an_images_folder_names_its_stream_where_its_own_name_is_another_stream(tmp_path: Path) -> None:
+    write_streams(tmp_path / "in", ["0", "1", "2"])
+    for kind in ("binary", "text"):
+        model = write_colmap(tmp_path / kind, names=["0/1.png", "1/2.png", "2/0.png"])
+        import_dat(tmp_path / "in", **STATED, cameras=model, out=tmp_path / f"out-{kind}")
+        for name, camera in open_scene(tmp_path / f"out-{kind}").cameras.items():
+            np.testing.assert_allclose(camera.w2c, CAMERAS[int(name)].w2c, atol=1e-9)
+
+
+def test_blank_lines_and_comments_of_a_text_model_are_left_out(tmp_path: Path) -> None:
+    write_streams(tmp_path / "in", [c.id for c in CAMERAS])
+    images = write_colmap(tmp_path / "text") / "images.txt"
+    first, *others = [line for line in images.read_text().splitlines() if line and not line.startswith("#")]
+    head, between = ["# list", "", f"  {first}", "1 2 -1"], [" # of the others", ""]
+    images.write_text("\n".join([*head, *between, *(text for line in others for text in (line, "")), ""]))
+    expected = {image.name for image in pycolmap.Reconstruction(str(tmp_path / "text")).images.values()}
+    assert expected == {f"{c.id}.png" for c in CAMERAS}, "COLMAP reads them so"
+    import_dat(tmp_path / "in", **STATED, cameras=tmp_path / "text", out=tmp_path / "out")
+    for name, camera in open_scene(tmp_path / "out").cameras.items():
+        np.testing.assert_allclose(camera.w2c, next(c for c in CAMERAS if c.id == name).w2c, atol=1e-9)
+
+
+def test_a_recording_with_its_description_does_not_lose_it(tmp_path: Path) -> None:
+    write_streams(tmp_path / "in", ["cam_00"])
+    import_dat(tmp_path / "in", **STATED, out=tmp_path / "recording")
+    with pytest.raises(UserError, match=r"recording: expected bare \.dat files, found a recording that stream\.json"):
+        import_dat(tmp_path / "recording", **STATED, cameras=write_colmap(tmp_path / "model"), out=tmp_path / "out")
+
+
 def test_images_of_a_colmap_camera_agree(tmp_path: Path) -> None:
     write_streams(tmp_path / "in", ["cam_00"])
     model = write_colmap(tmp_path / "binary", names=["cam_00/000001.png", "cam_00/000002.png", "cam_01/000001.png"])
@@ -233,6 +262,19 @@ def test_other_lenses_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="a lens of cam_00 whose model holds up to the image's corners"):
         import_dat(tmp_path / "in", **STATED, cameras=folded, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"])
+def test_a_colmap_fisheye_without_coefficients_is_no_pinhole(tmp_path: Path, model: str) -> None:
+    write_streams(tmp_path / "in", ["cam_00"])
+    zeros = [0.0] * (
+        len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params) - (3 + ("OPENCV" in model))
+    )
+    cameras = write_colmap(tmp_path / "model", model, zeros)
+    radius = np.hypot(WIDTH / 2, HEIGHT / 2)
+    off = radius - CAMERAS[0].fx * np.arctan(radius / CAMERAS[0].fx)
+    with pytest.raises(UserError, match=f"found another one, with {off:.2f} px, in cam_00"):
+        import_dat(tmp_path / "in", **STATED, cameras=cameras, out=tmp_path / "out")
 
 
 def test_fisheye_coefficients_are_opencvs() -> None:

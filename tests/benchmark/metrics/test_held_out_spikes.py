@@ -313,3 +313,13 @@ def test_motion_between_targets_is_in_the_expected_counts() -> None:
 def test_a_response_never_fires_twice_in_a_tick() -> None:
     response = Response(np.full(SHAPE, 1.4), np.full(SHAPE, 0.1), 1.4, np.ones(SHAPE, bool))
     assert response.rate(np.ones(SHAPE)).max() == 1
+
+
+def test_a_pixel_that_no_light_reaches_warns_of_nothing() -> None:
+    stream = SpikeStream(pack(np.random.default_rng(0).random((200, *SHAPE)) < 0.3), SHAPE[1], SHAPE[0], 2e4)
+    white, good = np.full(SHAPE, 0.5), np.ones(SHAPE, bool)
+    white[0, 0], good[0, 0] = 0, False
+    recorded = record_around(stream, 100, Response(white, np.zeros(SHAPE), 0.5, good))
+    images = [np.full(SHAPE, 0.6, np.float32)] * 3
+    found = view_spikes(recorded, [80, 100, 120], images, images).span_deviance
+    assert found is not None and not found[1][0, 0] and np.isfinite(found[0][found[1]]).all()

@@ -352,6 +352,14 @@ class TestWhatIsThere:
         report = fetch(str(release_folder), tmp_path, chosen)
         assert tree(folder) == whole and 0 < report.fetched <= 2 * BLOCK
 
+    def test_damage_of_a_camera_that_is_not_asked_for_is_seen_later(self, release_folder: Path, tmp_path: Path) -> None:
+        first, second = (Selection(("pattern-0",), (camera,), (), (100.0, 120.0)) for camera in ("cam_00", "cam_02"))
+        (folder,) = fetch(str(release_folder), tmp_path, first).folders
+        whole = tree(folder)["cam_00.dat"]
+        flip_bit(folder / "cam_00.dat", 7)
+        fetch(str(release_folder), tmp_path, second)
+        assert fetch(str(release_folder), tmp_path, first).fetched > 0 and tree(folder)["cam_00.dat"] == whole
+
 
 def check_goes_on(release_folder: Path, whole: dict[str, bytes], out: Path) -> None:
     """Check that what has its name is whole, and that another download does the rest alone."""

@@ -22,6 +22,8 @@ def test_the_digest_is_of_names_and_texts_of_python_files(tmp_path: Path) -> Non
 
     same = digest()
     assert digest(("notes.md", "anything")) == same
+    (tmp_path / "0/.#a.py").symlink_to("someone@machine.1:1")  # Emacs' lock of an unsaved file
+    assert sources_sha256([package("p", tmp_path / "0")]) == same
     assert len({same, digest(("a.py", "3")), digest(("c.py", "")), digest(("inner/b.py", "3"))}) == 4
     root = tmp_path / "0"
     assert sources_sha256([package("q", root)]) != same

@@ -6,6 +6,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -30,6 +31,7 @@ from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import Budget, UserError, get_method, open_scene
 from spike4dgs.benchmark.files import locked
+from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.cell import Failure, Job
 from spike4dgs.benchmark.runs.remote_cell import Fitted, Order, SharedFolder, fit_order, make_order, store
 
@@ -163,6 +165,19 @@ def test_an_order_gives_the_files_of_a_fit(tmp_path: Path, small_scene: Path, or
     stored, here = tmp_path / "stored/counts", tmp_path / "here/predictions/counts/pattern-0"
     assert (stored / "SHA256SUMS").read_bytes() == (here / "SHA256SUMS").read_bytes()
     assert not list(order.folder.root.glob("work/*")), "neither a checkpoint nor a lock stays"
+
+
+def test_a_model_comes_back_where_the_worker_has_its_own_files_on_another_disk(
+    tmp_path: Path, small_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = Path("/dev/shm")
+    if not os.access(memory, os.W_OK) or memory.stat().st_dev == tmp_path.stat().st_dev:
+        pytest.skip("one disk")
+    monkeypatch.setattr(tempfile, "tempdir", str(memory))
+    (folder := SharedFolder(tmp_path, "token")).token_file.write_text("token")
+    job = Job(Refines(tmp_path / "seen.json"), open_scene(small_scene), 0, "cpu", Budget())
+    fitted = fit_order(make_order(job, folder, tmp_path / "work/key", Apart()))
+    assert isinstance(fitted, Fitted) and fitted.model
 
 
 def test_an_order_says_whether_held_out_views_are_refined(tmp_path: Path, small_scene: Path) -> None:

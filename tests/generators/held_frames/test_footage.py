@@ -75,6 +75,18 @@ def colour(name: str) -> Callable[[Path], object]:
     return change
 
 
+def upside_down(folder: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.new("L", (WIDTH, HEIGHT)).save(folder / "cam_1/img_0.png", exif=exif)
+
+
+def pages(folder: Path) -> None:
+    (folder / "cam_1/img_0.png").unlink()
+    page = Image.new("L", (WIDTH, HEIGHT))
+    page.save(folder / "cam_1/img_0.tiff", save_all=True, append_images=[page] * 4)
+
+
 WIDE = Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16))
 REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "damaged": (lambda f: (f / "cam_1/img_0.png").write_bytes(b"no image"), "an image"),
@@ -83,6 +95,8 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "16 bits": (lambda f: WIDE.save(f / "cam_1/img_0.png"), "8 bits a channel"),
     "16 bits of colour": (colour("img_0.png"), "8 bits a channel, found mode RGB, of more bits"),
     "16 bits of colour in a TIFF": (colour("img_0.tiff"), "8 bits a channel, found mode RGB, of more bits"),
+    "turned by its EXIF data": (upside_down, "an image that is stored upright, found EXIF orientation 3"),
+    "pages of one file": (pages, "a file for each frame, found 5 frames in one"),
     "a camera twice": (lambda f: (f / "cam_1.mp4").write_bytes(b"no video"), "a video"),
     "no video": (lambda f: (f / "cam_2.mp4").write_bytes(b"no video"), "a video"),
     "an odd name": (lambda f: (f / "cam_1").rename(f / "cam 1!"), "the id of a camera"),

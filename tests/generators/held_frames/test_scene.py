@@ -134,6 +134,13 @@ def test_settings_that_do_not_fit_are_refused_before_anything_is_written(
     assert not (tmp_path / "scene").exists()
 
 
+def test_a_folder_that_names_no_scene_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    footage = find_footage(write_footage(tmp_path / "footage"))
+    with pytest.raises(UserError, match=r"^--out: expected the id of a scene"):
+        write_held_frames(tmp_path / "my fly", footage, CAMERAS, HOLDING)
+    assert not (tmp_path / "my fly").exists()
+
+
 def test_the_command_prints_errors_of_cameras_and_writes_the_scene(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

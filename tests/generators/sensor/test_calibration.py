@@ -14,6 +14,7 @@ from small_scenes import array_cameras, write_small_scene
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked
+from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.scene.calibration import Recordings, estimate, rates
 from spike4dgs.benchmark.scene.cameras import look_at
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -149,6 +150,12 @@ def test_methods_get_a_calibration_of_every_training_camera_or_none(tmp_path, sm
     assert len(scene.calibrations) == len(scene.cameras)
     for camera, found in zip(scene.cameras, scene.calibrations, strict=True):
         assert rms(found.gain, gain_map(camera.height, camera.width, 0, camera.id)) < 0.01
+
+
+def test_a_training_part_has_maps_of_its_training_cameras(tmp_path):
+    part = write_training_part(open_scene(scene_with_recordings(tmp_path / "scene", FACTS)), tmp_path / "part")
+    assert calibrate(part.root, out=tmp_path / "out") == 0
+    assert sorted(p.stem for p in (tmp_path / "out").glob("*.npz")) == sorted(part.train)
 
 
 def test_scenes_without_recordings_are_refused(tmp_path, small_scene):
