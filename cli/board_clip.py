@@ -52,7 +52,7 @@ def board_clip(
     if like is None:
         place = place_board(array(width, height, seed), columns, rows, square_m, DISTANCE_M)
     else:
-        place = place_board(tuple(open_scene(like).cameras.values()), columns, rows, square_m)
+        place = place_board(tuple(open_scene(like, allow_gaps=True).cameras.values()), columns, rows, square_m)
     path = write_board_clip(out, place.cameras, place.board, place.distance_m, n_ticks, seed)
     print(f"{path}: {n_ticks} ticks of {len(place.cameras)} cameras")
     print(

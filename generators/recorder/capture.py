@@ -158,11 +158,14 @@ class _Capture:
         """Return frames, gaps and statistics of every camera."""
         # Continuous mode has popped every block; else all of them still wait in the ring.
         runs = {c: self.cutters[c].cut(ring.blocks()) for c, ring in self.rings.items()}
-        n_ticks = self.n_ticks
+        n_ticks, cutters = self.n_ticks, self.cutters
+        if all(r.end not in (None, OK) and cutters[c].next_tick < n_ticks for c, r in self.readers.items()):
+            self.interrupted = True  # as where the array loses its power
         if self.interrupted:
-            # A camera that never had a whole frame is a gap, and takes nothing from the others.
-            sound = [n for c, r in self.readers.items() if r.end == OK and (n := self.cutters[c].next_tick)]
-            n_ticks = min(n_ticks, min(sound) if sound else max(c.next_tick for c in self.cutters.values()))
+            # A camera that never had a whole frame, or none after a loss, is a gap, and takes nothing from the others.
+            going_on = [c for c, reader in self.readers.items() if reader.end == OK and not cutters[c].ended]
+            sound = [n for c in going_on if (n := cutters[c].next_tick)]
+            n_ticks = min(n_ticks, min(sound) if sound else max(c.next_tick for c in cutters.values()))
         if n_ticks <= 0 or not any(c.next_tick for c in self.cutters.values()):
             raise _nothing()
         cameras = [self._camera_clip(c.id, runs[c.id], n_ticks) for c in self.profile.cameras if c.id in self.links]
@@ -291,7 +294,7 @@ def _primary(camera: CameraProfile) -> bool:
 def _slots(profile: RigProfile, layout: Layout, n_ticks: int, continuous: bool) -> int:
     """Return the number of ring slots: for the whole clip, or for `ring_seconds` and twice the reads in flight."""
     ticks = buffer_seconds(profile, n_ticks / profile.fps) * profile.fps if continuous else float(n_ticks)
-    if layout.count_tags and not continuous:
-        ticks += _SKEW_S * profile.fps  # frames before the tick that all cameras have
+    if not continuous:  # frames before the tick that all cameras have, or the part of one before the clip
+        ticks += _SKEW_S * profile.fps if layout.count_tags else 1
     slots = math.ceil(ticks * layout.frame_bytes / profile.transfer_bytes)
     return max(slots, 2 * profile.transfers) if continuous else slots + profile.transfers + _SPARE_SLOTS

@@ -17,7 +17,7 @@ from typing import Any
 from spike4dgs.benchmark.environment import command_line, environment, harness, utc_now
 from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.scene.scene import Target
-from spike4dgs.benchmark.scene.splits import standard_splits
+from spike4dgs.benchmark.scene.splits import Split, standard_splits
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
 from spike4dgs.benchmark.spikes.folder import write_stream_folder
 from spike4dgs.benchmark.spikes.stream import open_stream
@@ -29,9 +29,9 @@ from spike4dgs.generators.recorder.rig_profile import RigProfile
 class ClipRecord:
     """Facts of a recording besides its streams.
 
-    `cameras` are figures of each camera's capture, by id, for scene.json. `targets`, `extras` and `files` (path in the
-    folder -> file to copy) are for recordings with known ground truth, such as emulated ones; a rig without poses does
-    not write them.
+    `cameras` are figures of each camera's capture, by id, for scene.json. `targets`, `extras`, `files` (path in the
+    folder -> file to copy) and `splits` are for recordings with known ground truth, such as emulated ones; a rig
+    without poses does not write them. Without `splits` they are the standard ones.
     """
 
     n_ticks: int
@@ -43,6 +43,7 @@ class ClipRecord:
     targets: tuple[Target, ...] = ()
     extras: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     files: Mapping[str, Path] = field(default_factory=dict)
+    splits: Mapping[str, Split] = field(default_factory=dict)
 
 
 def write_description(out: Path, profile: RigProfile, record: ClipRecord) -> None:
@@ -94,7 +95,9 @@ def _finish_scene(out: Path, profile: RigProfile, record: ClipRecord) -> None:
             _copy(c.maps, out / f"calibration/maps/{c.id}.npz")
     for name, path in record.files.items():
         _copy(path, out / name)
-    name = out.resolve().name
+    name, splits = out.resolve().name, record.splits
+    if not splits and len(profile.held_out) == 1:
+        splits = standard_splits(cameras, profile.held_out[0])
     finish_scene(
         out,
         SceneDescription(
@@ -104,7 +107,7 @@ def _finish_scene(out: Path, profile: RigProfile, record: ClipRecord) -> None:
             cameras=cameras,
             train=tuple(c.id for c in cameras if c.id not in profile.held_out),
             test=profile.held_out,
-            splits=standard_splits(cameras, profile.held_out[0]) if len(profile.held_out) == 1 else {},
+            splits=splits,
             rate_hz=float(profile.fps),
             n_ticks=record.n_ticks,
             radiance_gain=profile.radiance_gain,

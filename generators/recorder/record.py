@@ -46,6 +46,7 @@ from spike4dgs.generators.recorder.sources import (
 from spike4dgs.generators.recorder.sync import SyncReport, fit_arrival
 from spike4dgs.generators.recorder.usb.link import Link, open_link
 from spike4dgs.generators.recorder.usb.ports import Port, usb_ports
+from spike4dgs.generators.recorder.usb.reads import OK
 
 LOST_DATA = 3  # exit code
 _PATIENCE = 3  # presses of Ctrl-C that abort even the writing of captured data
@@ -150,7 +151,7 @@ def record(
     print(f"{clip.n_ticks} ticks of {len(clip.cameras)} cameras: {out}")
     if worse_truth is not None:
         print(f"imperfections: {worse_truth}")
-    return 0 if clip.complete else LOST_DATA
+    return 0 if clip.complete and any(c.stats.end == OK for c in clip.cameras) else LOST_DATA
 
 
 def _source(rig: Path | None, mode: str, emulation: Emulation, worse: Imperfections, seconds: float | None) -> Source:
@@ -241,6 +242,7 @@ def _described(clip: Clip, sync: SyncReport, known: Truth) -> ClipRecord:
         targets=known.targets,
         extras=known.extras,
         files=known.files,
+        splits=known.splits,
     )
 
 

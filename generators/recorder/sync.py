@@ -127,7 +127,7 @@ class ArrivalFit:
 
 @dataclass(frozen=True)
 class SyncReport:
-    """The cameras' clocks, and the two that differ most in the time of the first or last tick."""
+    """The cameras' clocks, and the two that differ most in the time of the first tick or of the last that both have."""
 
     method: str  # Clip.sync
     cameras: tuple[ArrivalFit, ...]
@@ -145,6 +145,7 @@ def fit_arrival(clip: Clip, rate_hz: float) -> SyncReport:
     nominal_ns = 1e9 / rate_hz
     lines = {c.camera: _theil_sen(c.arrival.astype(np.float64)) for c in clip.cameras}
     known = {camera: line for camera, line in lines.items() if not math.isnan(line.slope)}
+    last = {c.camera: int(c.arrival[:, 0].max()) for c in clip.cameras if c.camera in known}
     middle = float(np.median([line.height for line in known.values()])) if known else math.nan
     fits = tuple(
         ArrivalFit(
@@ -161,7 +162,7 @@ def fit_arrival(clip: Clip, rate_hz: float) -> SyncReport:
     worst, pair = math.nan, None
     for a, b in itertools.combinations(known, 2):
         start = known[a].height - known[b].height
-        end = start + (known[a].slope - known[b].slope) * clip.n_ticks
+        end = start + (known[a].slope - known[b].slope) * min(clip.n_ticks, last[a], last[b])
         far = max(abs(start), abs(end)) * 1e-3
         if pair is None or far > worst:
             worst, pair = far, (a, b)

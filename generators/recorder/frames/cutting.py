@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,7 +33,7 @@ class Cutter:
         from_start: bool = False,
     ) -> None:
         self.next_tick = 0  # after the last frame
-        self._arrival: list[tuple[int, int]] = []
+        self._arrival = array("q")  # pairs; hours of reads fit into memory
         self._counter = TickCounter(layout, camera, origin, from_start)
         self._frame_bytes, self._lead = layout.frame_bytes, lead
         self._flat = ring.memory.reshape(-1)
@@ -61,6 +62,11 @@ class Cutter:
         """Return [m, 2]: number of complete ticks when a read ended, and its time (CLOCK_MONOTONIC, ns)."""
         return np.array(self._arrival, np.int64).reshape(-1, 2)
 
+    @property
+    def ended(self) -> bool:
+        """True if no later byte can become a tick."""
+        return self._counter.ended
+
     def _feed(self, group: list[Block]) -> list[Run]:
         data = group[0].data
         if len(group) > 1:
@@ -76,7 +82,9 @@ class Cutter:
             beyond = ends - run.frames.ctypes.data  # from the run's first byte; meaningless for a frame of two groups
             within = (beyond >= 0) & (beyond < run.frames.nbytes + self._frame_bytes)
             complete[within] = run.first_tick + np.minimum(beyond[within] // self._frame_bytes, len(run.frames))
-        self._arrival += [(int(t), b.arrival_ns) for t, b in zip(complete, group, strict=True) if t >= 0]
+        for tick, block in zip(complete, group, strict=True):
+            if tick >= 0:
+                self._arrival.extend((int(tick), block.arrival_ns))
         return runs
 
 

@@ -101,6 +101,11 @@ class TickCounter:
         self._ended = self._ended or (self._synced and not self._layout.count_tags)
         self._synced = False
 
+    @property
+    def ended(self) -> bool:
+        """True after a loss of unknown size behind which no tick can be known."""
+        return self._ended
+
     def finish(self, n_ticks: int, reason: str = INTERRUPTED) -> tuple[Gap, ...]:
         """Return the gaps of the clip [0, n_ticks): a missing end has the reason `reason` unless a loss caused it."""
         tail = Gap(self._camera, self._next, n_ticks - self._next, self._reason or reason)

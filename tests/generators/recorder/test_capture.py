@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,6 +103,43 @@ def test_an_interruption_keeps_the_ticks_that_every_camera_has() -> None:
     for i, camera in enumerate(clip.cameras):
         check_frames(camera, frames[i], 150)
     assert [len(c.ticks) for c in clip.cameras] == [150, 150, 20]
+
+
+def test_an_interruption_keeps_the_ticks_of_the_others_when_one_camera_was_torn() -> None:
+    """Without counters nothing later of it can be a tick, though its reads go on."""
+    profile, frames, links = make(2, "line-tagged", timeout_ms=60_000)
+    size = frames[1].shape[1]
+    links["cam_00"].stream = frames[0][:150].reshape(-1)
+    links["cam_01"].stream = np.delete(frames[1][:160].reshape(-1), slice(30 * size + 5, 30 * size + 9))
+    stop = threading.Event()
+
+    def end(rates: Mapping[str, Rate]) -> None:
+        if rates["cam_00"].ticks == 150 and rates["cam_01"].ticks >= 158:
+            stop.set()
+
+    clip = capture(profile, links, 400 / 20000, stop=stop, on_rate=end)
+    assert clip.interrupted and clip.n_ticks == 150
+    check_frames(clip.cameras[0], frames[0], 150)
+    assert len(clip.cameras[0].ticks) == 150 and len(clip.cameras[1].ticks) == 30
+    assert [(g.first_tick, g.ticks) for g in clip.cameras[1].gaps] == [(30, 120)]
+
+
+def test_a_clip_ends_where_all_cameras_failed() -> None:
+    profile, _, links = make(2)
+    for camera, tick in (("cam_00", 40), ("cam_01", 60)):
+        links[camera].faults = {30 * tick: UNPLUGGED}
+    clip = capture(profile, links, SECONDS)
+    assert clip.interrupted and clip.n_ticks == 60
+    assert [g.first_tick for camera in clip.cameras for g in camera.gaps] == [40]
+
+
+def test_small_reads_keep_the_end_of_a_clip_whose_camera_cannot_be_stopped() -> None:
+    profile = replace(rig(1, "line-tagged"), width=1000, height=1000, transfer_bytes=1024)
+    frames = [frames_of(0, layout_of(profile), 60)]
+    links = rig_of(frames, profile)
+    links["cam_00"].restartable = False
+    clip = capture(profile, links, 10 / 20000)
+    assert clip.complete and clip.n_ticks == 10
 
 
 def test_an_interruption_keeps_the_ticks_of_the_others_when_one_camera_never_had_a_whole_frame() -> None:

@@ -113,6 +113,24 @@ def test_a_camera_that_loses_data_gives_exit_code_3_and_a_gap(scene, tmp_path, m
     assert not capture.stream("cam_01").packed[30:].any()
 
 
+def test_a_recording_ends_where_the_whole_array_fails(scene, tmp_path, monkeypatch, capsys):
+    faulty(monkeypatch, *(Fault(f"cam_0{k}", "unplugged", tick=30) for k in range(4)))
+    assert record("--emulate", scene, "--out", tmp_path / "x", "--seconds", 5, "--continuous") == command.LOST_DATA
+    assert "ended early" in capsys.readouterr().out
+    capture = open_scene(tmp_path / "x")
+    assert capture.n_ticks == 30 and not capture.gaps
+    same_streams(capture, open_scene(scene), 30)
+
+
+def test_a_recording_has_the_splits_of_its_scene(scene, tmp_path):
+    """Poses that are a little wrong would break ties of distances in another way."""
+    copy = Path(shutil.copytree(scene, tmp_path / "copy"))
+    edit_json(copy / "scene.json", lambda meta: meta["splits"]["corner"]["train"].pop())
+    write_manifest(copy)
+    assert record("--emulate", copy, "--out", tmp_path / "x") == 0
+    assert open_scene(tmp_path / "x").meta["splits"] == open_scene(copy).meta["splits"]
+
+
 def test_missing_cameras_are_an_error_and_leave_no_files(scene, tmp_path, monkeypatch, capsys):
     faulty(monkeypatch, Fault("cam_02", "missing"))
     assert record("--emulate", scene, "--out", tmp_path / "x") == 2

@@ -56,6 +56,16 @@ def test_clocks_are_found_exactly_where_nothing_is_late() -> None:
     assert a.residual_us < 0.01 and a.reads == 500 and not b.suspect
 
 
+def test_a_camera_that_failed_early_is_compared_while_it_sent() -> None:
+    """Its slope is that of a few reads: over the whole clip it would be half a second off."""
+    delays = np.random.default_rng(0).exponential(100, (3, 500))
+    whole = {name: arrivals(0, 0, delays[k]) for k, name in enumerate("ab")}
+    found = fit_arrival(clip_of({**whole, "c": arrivals(0, 0, delays[2])[:5]}, 10_000), FPS)
+    alone = fit_arrival(clip_of({**whole, "c": np.empty((0, 2), np.int64)}, 10_000), FPS)
+    assert found.cameras[2].reads == 5 and found.worst_pair_us < 500
+    assert alone.worst_pair == ("a", "b")
+
+
 def test_late_reads_hardly_move_the_fit_and_are_reported() -> None:
     rng = np.random.default_rng(0)
     late = rng.exponential(40.0, 500)
