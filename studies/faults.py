@@ -18,10 +18,11 @@ from tyro.conf import Positional
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.environment import command_line, device_type, environment, harness
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import read_json, write_json, write_text
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json, write_text
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import mean, score_image
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
+from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.generators.recorder.emulation.imperfections import Imperfections
@@ -132,7 +133,8 @@ def fault_table(
             wanted = get_method(method)
             request = FitRequest(make_budget(budget), chosen, seed)
             run = partial(fit_recording, capture / "clip", wanted, folder, request, TFP)
-            found.append(Outcome(case, method, **_scored(run, folder, shown)))
+            by = sha256_json({"params": dict(getattr(wanted, "params", {})), "code": code_of(wanted)})
+            found.append(Outcome(case, method, **_scored(run, folder, shown, by)))
             _write(out, found, about)
     print(f"table: {out}/{{table.md,table.csv,table.json,table.png}}")
     return 0
@@ -166,17 +168,23 @@ def _capture(worse: Imperfections, scene: Path, out: Path, seed: int) -> None:
     record(out=out / "clip", emulation=shown, light=light, worse=worse)
 
 
-def _scored(fit: Callable[[], None], out: Path, truth: Scene) -> dict[str, Any]:
-    """Fit a capture and score its held-out cameras against the truth; finished scores are kept."""
+def _scored(fit: Callable[[], None], out: Path, truth: Scene, by: str) -> dict[str, Any]:
+    """Fit a capture and score its held-out cameras against the truth; finished scores of a fit `by` the same stay.
+
+    `by` is a digest of the method's settings, weights and code.
+    """
     kept = out / "scores.json"
-    if not kept.exists():
-        try:
-            fit()
-            scores: dict[str, Any] = {**_scores(out / PREDICTIONS, truth), "error": ""}
-        except UserError as e:  # the next run tries again
-            return {**dict.fromkeys(METRICS), "error": str(e)}
-        write_json(kept, scores)
-    return read_json(kept, "the scores of a fit")
+    if kept.is_file():
+        if (found := read_json(kept, "the scores of a fit")).pop("by", None) == by:
+            return found
+        shutil.rmtree(out)
+    try:
+        fit()
+        scores: dict[str, Any] = {**_scores(out / PREDICTIONS, truth), "error": ""}
+    except UserError as e:  # the next run tries again
+        return {**dict.fromkeys(METRICS), "error": str(e)}
+    write_json(kept, {**scores, "by": by})
+    return scores
 
 
 def _scores(folder: Path, truth: Scene) -> dict[str, float | None]:

@@ -33,7 +33,7 @@ from spike4dgs.method.self_calibration.shading import with_shadings
 from spike4dgs.method.starts.rig import rig
 from spike4dgs.method.training_views.pinholes import as_pinholes, with_lenses
 from spike4dgs.studies.kit.timing import by_turns_ms, show_table
-from spike4dgs.studies.speed_error.images import fired_stream, held_out
+from spike4dgs.studies.speed_error.images import filled_stream, fired_stream, held_out
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -146,7 +146,7 @@ def told(scene: Scene) -> dict[str, Calibration]:
     """Return what all cameras' clips tell, at the given poses, of the held-out cameras: smooth shadings, if any."""
     seen = replace(scene.training, recordings=())
     for camera in scene.test:
-        seen = with_camera(seen, scene.cameras[camera], scene.stream(camera), None)
+        seen = with_camera(seen, scene.cameras[camera], filled_stream(scene, camera), None)
     straight = as_pinholes(seen)
     start = rig(straight)
     shaded = with_shadings(seen, replace(start, cameras=with_lenses(straight, start.cameras)))

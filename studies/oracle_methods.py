@@ -192,9 +192,7 @@ class TrueImages(ImageMaker):
 
 def with_calibrations(scene: TrainingScene, calibrations: tuple[Calibration, ...]) -> TrainingScene:
     """Return a scene whose cameras' responses to light are given, in the place of estimates from their recordings."""
-    given = replace(scene)
-    given.__dict__["calibrations"] = calibrations  # where the scene keeps its estimates once they are made
-    return given
+    return replace(scene, known_calibrations=calibrations)
 
 
 def true_points(surfaces: Surfaces, request: StartRequest) -> Start:

@@ -145,13 +145,16 @@ class WorldTruth:
 def find_truth(scene: Scene) -> WorldTruth:
     """Return the truth of a scene at the training cameras of its split.
 
-    Raises UserError where no world of this installation made the scene, and where its cameras are others than the
-    world's.
+    Raises UserError where no world of this installation made the scene, where its cameras are others than the world's,
+    and where they or the light move with time, which the renderings here do not.
     """
     fix = "make the scene with `spike4dgs make-dataset`"
     if (job := recorded_job(scene.meta["source"])) is None:
         source = scene.meta["source"]
         raise problem(scene.root, "a scene whose world is here, for oracles", f"source {source.get('kind')!r}", fix)
+    if job.physics.moves_array or job.flicker or world_of(job).flash:
+        expected = "an array at rest in steady light, for oracles"
+        raise problem(scene.root, expected, "another", "use a scene without array motion, flicker and flash")
     made = {camera.id: camera for camera in cameras_of(job)}
     cameras = [made[c] for c in scene.train if c in made and _alike(made[c], scene.cameras[c])]
     if len(cameras) < len(scene.train):

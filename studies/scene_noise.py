@@ -75,7 +75,7 @@ def _row(report: dict[str, Any], scene: Path) -> list[str]:
     streams, truth = noise["streams"], noise["truth"]
     return [
         report["scene"],
-        short(open_scene(scene).revision),
+        short(open_scene(scene, allow_gaps=True).revision),
         f"{report['total_s'] - report['stages_s'].get('audit', 0):.0f}",
         " / ".join(_number(streams[region]) for region in _REGIONS),
         _number(streams["correlation_moving"], 2),

@@ -55,6 +55,7 @@ class TrainingScene(Shown):
     found_frames: Mapping[str, Frames] = field(default_factory=dict)  # by camera; see `frames`
     found_events: Mapping[str, EventStream] = field(default_factory=dict)  # by camera; see `events`
     states: Mapping[str, CameraState] = field(default_factory=dict)  # by camera; see `state`
+    known_calibrations: tuple[Calibration, ...] = ()  # of each camera, in the place of estimates: of an oracle
 
     def state(self, camera: str) -> CameraState:
         """Return a camera's clock, gain, dark rate and bad pixels, as far as they were estimated."""
@@ -71,11 +72,12 @@ class TrainingScene(Shown):
     @cached_property
     def calibrations(self) -> tuple[Calibration, ...] | None:
         """Each camera's response to light, from its recordings and its state; None unless all have recordings."""
-        known = [r for r in self.recordings if r is not None]
-        if not known or len(known) < len(self.cameras):
-            return None
-        found = zip(self.cameras, map(estimate, known), strict=True)
-        return tuple(c.in_dark_of(self.state(camera.id).dark) for camera, c in found)
+        found, recorded = self.known_calibrations, [r for r in self.recordings if r is not None]
+        if not found:
+            if not recorded or len(recorded) < len(self.cameras):
+                return None
+            found = tuple(map(estimate, recorded))
+        return tuple(c.in_dark_of(self.state(s.id).dark) for s, c in zip(self.cameras, found, strict=True))
 
     @property
     def duration_us(self) -> float:

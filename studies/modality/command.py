@@ -91,7 +91,7 @@ def modality(
 
     Args:
         scenes: Scene folders with frames and events, of `make-dataset`, best of 0.1 s: 20 ms hold one frame.
-        out: Folder for the results, and for what `run-benchmark` keeps.
+        out: Folder for the results, and for what `run-benchmark` keeps; of another split than the default, OUT/SPLIT.
         seed: Seed that every fit gets.
         seeds: Number of seeds, from that one up; the table shows means over them.
         workers: Processes that fit, each on its share of this machine's cores.
@@ -102,6 +102,8 @@ def modality(
     opened, console = open_scenes(scenes, split=split), make_console()
     methods = [get_method(name) for name in ROWS]
     chosen = choose_device_for(methods, device)
+    if split and not all(scene.is_default_split for scene in opened):
+        out = out / split
     settings = Settings(out, seed, chosen, make_budget(budget), ("psnr",), seeds, workers, apart=Apart())
     rows = compare(opened, methods, settings, console)
     failed = [f"{row.method} on {scene}: {why}" for row in rows for scene, why in row.errors.items()]

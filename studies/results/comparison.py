@@ -7,14 +7,14 @@ widened for few scenes. Those of a table's rows hold together with 95 %; that of
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import fmean
 
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.leaderboard.page.intervals import Comparison, compare
+from spike4dgs.leaderboard.page.intervals import FEWEST_SCENES, Comparison, compare
 from spike4dgs.studies.results.records import Record
 
 RANKED_BY = "psnr_dynamic"  # where things move is what the cameras are for
@@ -155,4 +155,10 @@ def lead(row: MeasuredRow, rivals: Sequence[MeasuredRow], metric: str) -> Lead |
 
 def _compared(rows: Sequence[MeasuredRow], metric: str) -> Comparison:
     values = [row.values(metric) for row in rows]
-    return compare([v for v in values if v is not None], higher_is_better=True)
+    found = compare([v for v in values if v is not None], higher_is_better=True)
+    if len(rows[0].scenes) >= FEWEST_SCENES:
+        return found
+    # Of fewer scenes, images would be drawn, and a record has one value a scene: nothing is known.
+    n = len(rows)
+    half_widths = np.where(np.eye(n) > 0, 0.0, np.inf)
+    return replace(found, half_widths=half_widths, better=np.zeros((n, n), np.bool_))

@@ -40,6 +40,7 @@ class Study:
     folder: Path
     samples: int
     code: str  # a digest of it
+    renderer: str  # the second one's version
 
     @property
     def world(self) -> WorldScene:
@@ -58,6 +59,7 @@ class Study:
     def kept(self, name: str, make: Any, *arguments: Any) -> Float32:
         """Return the images of this name, which `make` of the arguments renders if they are not there yet."""
         key = {"job": self.job.settings, "tick": _TICK, "samples": self.samples, "code": self.code, "name": name}
+        key |= {"renderer": self.renderer}
         return kept(self.folder / f"{name}.npz", key, partial(make, *arguments))
 
 
@@ -86,7 +88,7 @@ def second_renderer(
     profile = SPLIT_PROFILES[_PROFILE]
     for name in worlds:
         job = Job(name, _VARIANT, 0, _PROFILE, profile, profile.seconds)
-        record, row = measure(Study(job, out / "renderings" / name, samples, code_now()), blender)
+        record, row = measure(Study(job, out / "renderings" / name, samples, code_now(), blender.version), blender)
         records.append(record)
         rows.append(row)
     report = {

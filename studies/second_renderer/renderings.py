@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def kept(path: Path, key: object, make: Callable[[], Float32]) -> Float32:
         with np.load(path) as file:
             if str(file["key"]) == own:
                 return np.asarray(file["images"])
-    except (OSError, KeyError, ValueError):
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile):
         pass  # no file, or a damaged one
     images = make()
     with atomic_path(path) as part:

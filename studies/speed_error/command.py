@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.studies.kit.measurement import Measurement, Request, Size
 from spike4dgs.studies.kit.runner import in_order, run_study
 
@@ -73,4 +74,5 @@ def speed_error(
         return out / "scenes" / f"car-0-{profile}"
 
     request = Request(size, seed, made)
-    return run_study(measurements, request, out, {"scene": str(scene or "")}, again)
+    of = {"scene": open_scene(scene).revision if scene else ""}
+    return run_study(measurements, request, out, of, again)

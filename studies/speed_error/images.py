@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from spike4dgs.baselines.images.tfp import HALF_WINDOW, tfp_image
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
+from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.studies.kit.measurement import TIMES, Column, Point, Request, Series, measurement
 from spike4dgs.studies.kit.timing import by_turns_ms
@@ -36,8 +37,14 @@ def fired_stream(ticks: int, width: int, height: int, seed: int = 0) -> SpikeStr
 
 
 def held_out(scene: Scene, target: Target) -> tuple[SpikeStream, int, float]:
-    """Return the stream, the tick and the gain that a maker gets for a scored image."""
-    return scene.stream(target.camera), target.tick, scene.radiance_gain
+    """Return the stream, the tick and the gain that a maker gets for a scored image; lost ticks are filled."""
+    return filled_stream(scene, target.camera), target.tick, scene.radiance_gain
+
+
+@lru_cache(maxsize=2)
+def filled_stream(scene: Scene, camera: str) -> SpikeStream:
+    """Return a camera's stream as makers get it: lost ticks are no darkness."""
+    return fill_gaps(scene.stream(camera))
 
 
 def _window(half_window: int, scene: Scene, target: Target) -> Float32:

@@ -12,22 +12,20 @@ have the steps that they have in tables: what is best at a quarter of them is no
 from __future__ import annotations
 
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from tyro.conf import Positional
 
 from spike4dgs.baselines import recipes as theirs
 from spike4dgs.benchmark.environment import command_line, cpu_name, device_type, harness, utc_now
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, write_json, write_text
+from spike4dgs.benchmark.files import read_json, sha256_json, write_json, write_text
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, choose_device_for, get_method, make_budget
-from spike4dgs.benchmark.runs.run import Settings, run_matrix
+from spike4dgs.benchmark.runs.record import check_scenes
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS
 from spike4dgs.method import recipes as ours
@@ -36,14 +34,12 @@ from spike4dgs.method.tuned import read_tuned
 from spike4dgs.studies.kit.blocks import table_rows, with_block
 from spike4dgs.studies.kit.checkout import code_now, find_checkout
 from spike4dgs.studies.kit.timing import markdown, write_csv
-from spike4dgs.studies.tuning.kept import keeping
 from spike4dgs.studies.tuning.knobs import Values, as_settings, knobs_of, start_of
+from spike4dgs.studies.tuning.trial_fits import METRICS, Fit, fit_by, keeping
 
 TRIALS = 24
 _RANDOM = 8  # trials before the search follows what it has seen
-_METRICS = ("psnr", "psnr_dynamic")
 Trial = dict[str, Any]  # number, knobs, scores by scene (dB), seconds
-Fit = Callable[[RecipeMethod, Scene], Mapping[str, float]]
 
 
 def tuning(
@@ -72,6 +68,7 @@ def tuning(
         write: Write what OUT has found into this checkout: recipes X.tuned, and the page of results.
     """
     opened = open_scenes(scenes)
+    check_scenes(opened)
     for scene in opened:
         if (variant := scene.meta["source"].get("variant")) not in DEVELOPMENT_VARIANTS:
             expected = f"a development variant ({', '.join(map(str, DEVELOPMENT_VARIANTS))})"
@@ -82,8 +79,8 @@ def tuning(
         method = keeping(recipe, chosen)
         of = {scene.id: scene.revision for scene in opened}
         about = {"row": method.name, "scenes": of, "budget": make_budget(budget).label, "seed": seed}
-        about |= {"device": device_type(chosen), "code": code_now()}
-        search(method, opened, out / f"{method.name}.json", about, trials, _fit_by(seed, chosen, budget), print)
+        about |= {"device": device_type(chosen), "code": code_now(), "method": sha256_json(recipe.params)}
+        search(method, opened, out / f"{method.name}.json", about, trials, fit_by(seed, chosen, budget), print)
         write_results(out)
     print(f"table: {out / 'tuning.md'}")
     if write:
@@ -102,7 +99,8 @@ def search(
 ) -> dict[str, Any]:
     """Run, or go on with, the search of a recipe; return what `path` keeps of it.
 
-    `about` says what makes trials comparable. Raises UserError where `path` has a search of something else.
+    `about` says what makes trials comparable. Raises UserError where `path` has a search of something else, and where
+    the recipe as it is fails.
     """
     record: dict[str, Any] = {**about, "commit": harness()["commit"], "cpu": cpu_name(), "trials": []}
     if path.is_file():
@@ -114,6 +112,9 @@ def search(
     while len(done) < trials:
         start, knobs = time.perf_counter(), propose(method, done, int(about["seed"]))
         scores = _scores(variant(method, knobs), scenes, done, fit)
+        if not done and not all(any(found) for found in scores.values()):
+            fix = "see the message above"
+            raise problem(path, "a fit of the recipe as it is on every scene", "one that failed", fix)
         done.append(
             {
                 "number": len(done),
@@ -168,7 +169,7 @@ def _scores(method: RecipeMethod, scenes: Sequence[Scene], done: Sequence[Trial]
     scores: dict[str, list[float]] = {}
     for scene in scenes:
         found = fit(method, scene)
-        scores[scene.id] = [round(found[name], 4) for name in _METRICS]
+        scores[scene.id] = [round(found[name], 4) for name in METRICS]
         earlier = [_mean(t["scores"], scores) for t in done if set(scores) <= set(t["scores"])]
         if len(earlier) >= _RANDOM and _mean(scores, scores) < statistics.median(earlier):
             break
@@ -192,19 +193,6 @@ def best_of(done: Sequence[Trial], scenes: int) -> Trial:
     return max((t for t in done if len(t["scores"]) == scenes), key=lambda t: gain_of(t, done[0]))
 
 
-def _fit_by(seed: int, device: str, budget: str) -> Fit:
-    def fit(method: RecipeMethod, scene: Scene) -> dict[str, float]:
-        with tempfile.TemporaryDirectory(prefix="spike4dgs-tuning-") as folder:
-            settings = Settings(Path(folder), seed, device, make_budget(budget), ())
-            (record,) = run_matrix([scene], [method], settings, Console(quiet=True))
-        cell = record["scenes"][scene.id]
-        if cell["status"] != "ok":
-            return dict.fromkeys(_METRICS, 0.0)
-        return {name: cell["metrics"][name] for name in _METRICS}
-
-    return fit
-
-
 def _recipe(name: str) -> RecipeMethod:
     method = get_method(name)
     if not isinstance(method, RecipeMethod):
@@ -223,14 +211,14 @@ def write_results(out: Path) -> None:
         steps = _short(record["budget"])
         cells = (steps, _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
         rows.append((f"`{record['row']}`", *cells))
-        heads = ["trial", *first["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in _METRICS), "seconds"]
+        heads = ["trial", *first["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in METRICS), "seconds"]
         write_csv(out / f"{record['row']}@{steps}.csv", heads, [_line(trial, record["scenes"]) for trial in done])
     write_text(out / "tuning.md", "\n".join([*markdown(columns, rows), ""]))
 
 
 def _line(trial: Trial, scenes: Iterable[str]) -> list[Any]:
     """Return a trial's line of the CSV; scenes that it did not see have empty cells."""
-    scores = [score for scene in scenes for score in trial["scores"].get(scene, [None] * len(_METRICS))]
+    scores = [score for scene in scenes for score in trial["scores"].get(scene, [None] * len(METRICS))]
     return [trial["number"], *map(_short, trial["knobs"].values()), *scores, trial["seconds"]]
 
 

@@ -97,6 +97,16 @@ def test_a_fit_that_was_refused_is_tried_again(tiny_data: Path, out: Path, monke
     assert main(command) == 0 and kept.exists()
 
 
+def test_scores_of_another_method_of_that_name_are_made_anew(tiny_data: Path, out: Path, monkeypatch) -> None:
+    """Such as of one with other weights or settings."""
+    monkeypatch.setattr(fault_table, "CASES", CASES[:1])
+    kept = out / "fits/none/tfp+static/scores.json"
+    before = json.loads(kept.read_text())
+    edit_json(kept, lambda scores: scores.update(by="another", psnr=99.0))
+    assert main(["fault-table", str(tiny_data / "car-0-tiny"), *COMMAND, "--out", str(out)]) == 0
+    assert json.loads(kept.read_text()) == before
+
+
 def refuse() -> None:
     raise UserError("no weights")
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
-from small_scenes import GAIN, HEIGHT, WIDTH, add_gap, array_cameras, write_small_scene
+from small_scenes import GAIN, HEIGHT, WIDTH, add_gap, array_cameras, lose_ticks, write_small_scene
 
 from spike4dgs.baselines.images.table import IMAGES, ImageMaker
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.scene.calibration import estimate
 from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.spikes.repair import fill_gaps
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.cli import main
 from spike4dgs.generators.sensor import calibration as calibration
@@ -23,6 +24,7 @@ from spike4dgs.generators.sensor.model import Sensor
 from spike4dgs.method.settings import Settings
 from spike4dgs.studies import images
 from spike4dgs.studies.kit.timing import show_table
+from spike4dgs.studies.speed_error.images import held_out
 
 
 def needs_weights(stream: SpikeStream, tick: int, settings: Settings) -> np.ndarray:
@@ -138,6 +140,16 @@ def test_gaps_are_refused_unless_allowed(small_scene: Path, tmp_path: Path, monk
     assert main(command) == 2
     assert "pass --allow-gaps" in capsys.readouterr().err
     assert main([*command, "--allow-gaps"]) == 0
+
+
+@pytest.mark.parametrize("maker", ["tfp", "tfi", "adaptive"])
+def test_lost_ticks_are_no_darkness(small_scene: Path, maker: str) -> None:
+    target = open_scene(small_scene).targets[1]
+    lose_ticks(small_scene, target.camera, target.tick - 8, 6)
+    scene = open_scene(small_scene, allow_gaps=True)
+    stream, tick, gain = held_out(scene, target)
+    filled = fill_gaps(scene.stream(target.camera))
+    assert np.array_equal(IMAGES[maker](stream, [tick], gain), IMAGES[maker](filled, [tick], gain))
 
 
 def test_notes_stand_below_the_table_and_in_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

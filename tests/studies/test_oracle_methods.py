@@ -23,6 +23,7 @@ from spike4dgs.method.gaussians.parameters import from_points
 from spike4dgs.method.images.training import ImageSettings, choose_ticks, make_training_images
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.starts.base import StartRequest
+from spike4dgs.method.training_views.pinholes import as_pinholes
 from spike4dgs.studies import oracle_methods as oracle
 from spike4dgs.studies.oracle_methods import (
     RUNGS,
@@ -129,6 +130,9 @@ def test_true_calibrations_take_the_place_of_estimates(truth: Truth) -> None:
     given = with_calibrations(SCENE, truth.calibrations(GAIN))
     assert SCENE.calibrations is None and given.calibrations is not None
     camera: Calibration = given.calibrations[1]
+    bent = replace(given, cameras=tuple(replace(c, distortion=(-0.1, 0, 0, 0, 0)) for c in given.cameras))
+    for copy in (replace(given, cameras=given.cameras[::-1]), as_pinholes(bent)):  # as fits with poses and lenses make
+        assert copy.calibrations is not None and copy.calibrations[1].gain is camera.gain
     radiance = np.full((WORLD.height, WORLD.width), 0.4, np.float32)
     assert camera.radiance(GAIN * camera.gain * radiance + camera.dark) == pytest.approx(radiance, abs=1e-6)
     raw, corrected = (

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_json
 from toy_fits import silent
 
 from spike4dgs.benchmark.errors import UserError
@@ -150,6 +151,17 @@ def test_what_is_there_is_kept_and_what_is_missing_is_made_again_alike(scene: Sc
 def test_scenes_that_no_world_here_made_are_refused(small_scene: Path) -> None:
     with pytest.raises(UserError, match="expected a scene whose world is here"):
         find_truth(open_scene(small_scene))
+
+
+@pytest.mark.parametrize("physics", [{"flicker": 0.08}, {"array_motion": 2.0}])
+def test_scenes_whose_light_or_array_changes_are_refused(
+    tiny_data: Path, tmp_path: Path, physics: dict[str, float]
+) -> None:
+    scene = Path(shutil.copytree(tiny_data / "car-0-tiny", tmp_path / "copy"))
+    edit_json(scene / "scene.json", lambda meta: meta["source"].update(physics=physics))
+    write_manifest(scene)
+    with pytest.raises(UserError, match="expected an array at rest in steady light"):
+        find_truth(open_scene(scene))
 
 
 def test_scenes_with_other_cameras_than_their_worlds_are_refused(tiny_data: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from small_scenes import add_gap
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -29,6 +30,8 @@ def test_a_row_has_the_audits_figures_and_the_time_without_it(small_scene, tmp_p
     assert head == f"| {' | '.join(COLUMNS)} |"
     names = f"{small_scene.name} | {scene.revision[:12]}"
     assert rows == [f"| {names} | 220 | 55.1 / 47.9 / - | 0.25 | 58.0 / 53.0 / 52.5 | 1.3 | 48.0 |"]
+    add_gap(small_scene, "cam_01", 30, 2)
+    assert scene_noise((folder,), out=tmp_path / "out") == 0, "audited scenes may have lost ticks"
     assert small_scene.name in capsys.readouterr().out and (tmp_path / "out/noise.png").stat().st_size > 1000
 
 

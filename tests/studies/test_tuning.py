@@ -22,9 +22,18 @@ from spike4dgs.method.images.training import make_training_images
 from spike4dgs.method.settings import override
 from spike4dgs.method.starts.base import StartRequest
 from spike4dgs.method.tuned import read_tuned, tuned
-from spike4dgs.studies.tuning.kept import keeping
 from spike4dgs.studies.tuning.knobs import STEPS_OF_TWO, as_settings, knobs_of, start_of
-from spike4dgs.studies.tuning.search import TRIALS, best_of, gain_of, publish, search, tuning, variant, write_results
+from spike4dgs.studies.tuning.search import (
+    TRIALS,
+    best_of,
+    gain_of,
+    publish,
+    search,
+    tuning,
+    variant,
+    write_results,
+)
+from spike4dgs.studies.tuning.trial_fits import fit_by, keeping
 
 ROWS = ("tfp+stg", "tfi+4dgs", "spk2img+d3dgs", "dy-spikenerf", "spike4dgs", "spike4dgs-x", "tfp+rig-flat+4dgs")
 
@@ -142,6 +151,25 @@ def test_a_killed_search_goes_on_as_if_nothing_had_happened(whole, tmp_path):
     assert [[t[k] for k in same] for t in found["trials"]] == [[t[k] for k in same] for t in whole[0]["trials"]]
     with pytest.raises(UserError, match="another"):
         search(get_method("tfp+stg"), SCENES, path, {**ABOUT, "seed": 1}, 24, _fit, print)
+
+
+def test_a_first_trial_that_fails_on_a_scene_is_no_search(tmp_path):
+    """Else all others would be compared with 0 dB."""
+
+    def fit(method, scene):
+        return _fit(method, scene) if scene.id == "a" else {"psnr": 0.0, "psnr_dynamic": 0.0}
+
+    path = tmp_path / "tfp+stg.json"
+    with pytest.raises(UserError, match="a fit of the recipe as it is on every scene, found one that failed"):
+        search(get_method("tfp+stg"), SCENES, path, ABOUT, TRIALS, fit, print)
+    assert not path.exists()
+
+
+def test_a_recipe_without_its_weights_is_not_searched(small_scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv("SPIKE4DGS_WEIGHTS", raising=False)
+    with pytest.raises(UserError, match=r"ssir\+stg on pattern-0: expected a fit"):
+        fit_by(0, "cpu", "0.02")(get_method("ssir+stg"), open_scene(small_scene))
 
 
 KEPT = "| `tfp+stg` | 1 | of another search |"

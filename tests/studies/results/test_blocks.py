@@ -522,6 +522,16 @@ def test_what_ours_reaches_on_each_scene_and_in_the_mean():
     assert "18 of 27 planned cells" in lines[-1]
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_scenes_tell_no_ranks_and_no_lead(count: int) -> None:
+    """A record has one value a scene: nothing says how much it varies."""
+    group = replace(GROUP, scenes=SCENES[:count])
+    found = [record("a", scene, 30.0) for scene in group.scenes] + [record(OURS, s, 35.0) for s in group.scenes]
+    lines = blocks.table_block(group, found)
+    assert lines[4].startswith(f"| 1-2 | `{OURS}` |") and lines[5].startswith("| 1-2 | `a` | 30.00 | 5.00 |")
+    assert "even with `a` where things move (5.00 dB)" in blocks.lead_block(group, found)[2]
+
+
 def test_what_the_missing_flat_fields_cost_on_each_scene_and_in_the_mean():
     scenes, without = blocks.NINE.scenes, "spike4dgs-x+self-calibrated"
     found = [record(OURS, scene, 30.0 + k, seed) for k, scene in enumerate(scenes) for seed in (0, 1)]

@@ -1,10 +1,12 @@
 """The command itself: every room's measurements in the smallest size, on a small scene, to the page."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.cli import main
@@ -54,7 +56,8 @@ def test_a_scene_is_made_once_and_only_when_asked(tmp_path: Path, monkeypatch: p
     assert made == [([SceneSettings("tiny", 0).job("car")], tmp_path / "a/scenes")]
     report = json.loads((tmp_path / "a/speed_error.json").read_text())
     assert report["size"] == "quick" and report["measurements"][0]["series"][0]["name"] == "car-0-tiny"
-    assert speed_error.speed_error(out=tmp_path / "b", size="tiny", scene=tmp_path) == 0 and len(made) == 1
+    scene = write_small_scene(tmp_path / "scene")
+    assert speed_error.speed_error(out=tmp_path / "b", size="tiny", scene=scene) == 0 and len(made) == 1
 
 
 def test_a_failure_is_exit_1_and_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -64,10 +67,14 @@ def test_a_failure_is_exit_1_and_is_written(tmp_path: Path, monkeypatch: pytest.
     assert "OSError: no luck" in (tmp_path / "a/index.html").read_text()
 
 
-def test_what_was_measured_is_measured_again_where_that_is_asked(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_what_was_measured_is_measured_again_where_that_is_asked_and_on_another_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(speed_error, "plan", measurements)
-    for again, kept in ((False, False), (False, True), (True, False)):
-        speed_error.speed_error(out=tmp_path / "a", size="tiny", scene=tmp_path, again=again)
+    for seed, again, kept in ((0, False, False), (0, False, True), (0, True, False), (1, False, False)):
+        shutil.rmtree(tmp_path / "scene", ignore_errors=True)  # of one name, whatever is in it
+        scene = write_small_scene(tmp_path / "scene", seed=seed)
+        speed_error.speed_error(out=tmp_path / "a", size="tiny", scene=scene, again=again)
         assert ("one: kept" in capsys.readouterr().out) == kept
 
 
