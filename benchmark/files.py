@@ -64,6 +64,15 @@ def writing(path: Path) -> Iterator[None]:
         raise failure from e
 
 
+def check_writable(folder: Path) -> None:
+    """Make a folder, and raise UserError where no file can be written into it: before long work, not after it."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".{os.getpid()}.part"
+        probe.touch()
+        probe.unlink()
+
+
 def failure_of(error: OSError, path: Path | str) -> UserError | None:
     """Return what the system said while `path` was written as a UserError; None for an error that is the program's."""
     nowhere = error.errno == errno.ENOENT and str(path).startswith(_SYSTEM)

@@ -42,6 +42,7 @@ def at_pace(
     pace = moved / MOST_PX
     print(f"{scene}: fast motion, {moved:.1f} px between images: images and pieces that much shorter", file=sys.stderr)
     denser = {**settings, "images": settings["images"].denser(pace)}
+    del images  # the others are as large
     return make(maker.with_settings(maker.settings.denser(pace)), denser["images"]), denser, pace
 
 

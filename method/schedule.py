@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.method.settings import Settings
+from spike4dgs.method.settings import Settings, check_numbers
 from spike4dgs.method.splat.types import EPS2D, PixelFilter
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.training_views.changes import POINTS
@@ -59,14 +59,15 @@ class TrainerSettings(Settings):
 
     def __post_init__(self) -> None:
         wanted = {
+            "coarse_share above 0, at most 1": (self.coarse_share, 0 < self.coarse_share <= 1),
+            "beta1 from 0, below 1": (self.beta1, 0 <= self.beta1 < 1),
+            "beta2 from 0, below 1": (self.beta2, 0 <= self.beta2 < 1),
             "initial_opacity between 0 and 1": (self.initial_opacity, 0 < self.initial_opacity < 1),
             "initial_scale above 0": (self.initial_scale, self.initial_scale > 0),
             "views_per_step of 1 or more": (self.views_per_step, self.views_per_step >= 1),
             "ramp from 0 to 1": (self.ramp, 0 <= self.ramp <= 1),
         }
-        for expected, (value, holds) in wanted.items():
-            if not holds:
-                raise problem("settings of trainer", expected, str(value), "correct the number")
+        check_numbers("trainer", wanted)
 
     @property
     def pixel_filter(self) -> PixelFilter:

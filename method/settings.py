@@ -29,6 +29,13 @@ class Settings:
         return self
 
 
+def check_numbers(part: str, wanted: Mapping[str, tuple[float, bool]]) -> None:
+    """Raise UserError for the first number of a part that no fit can use: what is expected -> value, whether it is."""
+    for expected, (value, holds) in wanted.items():
+        if not holds:
+            raise problem(f"settings of {part}", expected, str(value), "correct the number")
+
+
 FLAT_FIELD = "flat_field"  # a setting of images, which initialisations that have it too follow
 VIEWS_PER_STEP = "views_per_step"  # a setting of parts whose steps have several views
 SettingsByPart = Mapping[str, Settings]

@@ -14,7 +14,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.benchmark.files import atomic_path, write_json
+from spike4dgs.benchmark.files import atomic_path, check_writable, write_json
 from spike4dgs.benchmark.method import FitRequest, make_budget, training_for
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
@@ -81,20 +81,21 @@ def patterns(
         allow_gaps: Accept a recording with gaps.
     """
     training = open_scene(scene, allow_gaps).training
+    true, out = training.calibrations, out / training.id
+    check_writable(out)  # before the fit
     with RunDisplay(make_console(), 1) as display, display.cell(f"patterns of {training.id}") as shown:
         request = FitRequest(make_budget(budget), device, seed, shown.progress)
         method = METHODS[SELF_CALIBRATED.name]
         model = method.fit(training_for(method, training), request)
     assert isinstance(model, FittedModel)
     gain, dark = (model.estimates[name].cpu().numpy().astype(np.float64) for name in ("gain", "dark"))
-    out = out / training.id
     (out / "errors.json").unlink(missing_ok=True)  # of another fit
     for camera, g, d in zip(training.cameras, gain, dark, strict=True):
         with atomic_path(out / f"{camera.id}.npz") as part:
             np.savez(part, allow_pickle=False, gain=g.astype(np.float32), dark=d.astype(np.float32))
     _plot(training, gain, out / "gain.png")
-    if training.calibrations:
-        rows = pattern_errors(gain, dark, training.calibrations)
+    if true:
+        rows = pattern_errors(gain, dark, true)
         ids = [camera.id for camera in training.cameras]
         texts = [[id, *(f"{row[key]:.2f}" for key in COLUMNS)] for id, row in zip(ids, rows, strict=True)]
         show_table("", ["camera", *COLUMNS.values()], texts, None)

@@ -35,6 +35,7 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Writ
 
     check_video(path)
     with atomic_path(path) as part:
+        part.touch()  # OpenCV does not say why it cannot write
         for codec in CODECS[path.suffix]:
             writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
             if writer.isOpened():

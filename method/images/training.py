@@ -115,7 +115,8 @@ def make_images(
         lit = make.in_light(_own_light(light, stream, state.clock)) if light else make
         images[:, c], over, doubtful = lit.with_spans(stream, own, gain, calibration)
         if over is not None:
-            spans.append(over.astype(np.float16))
+            with np.errstate(over="ignore"):  # beyond 65,504 ticks infinite: no correction follows spans that long
+                spans.append(over.astype(np.float16))
             doubts.append(None if doubtful is None else doubtful.astype(np.float16))
         spike_trains.cache_clear()  # else two streams' trains would be in memory
         stream.release()

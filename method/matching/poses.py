@@ -44,10 +44,13 @@ class Solved:
     adjusted: Adjusted
 
     def points_kept(self) -> Int64:
-        """Return the numbers of the tracks that two views or more see in front of them, within `CERTAIN` errors."""
+        """Return the numbers of the tracks in front of the views that enough of them see within `CERTAIN` errors.
+
+        That is two beside the track's own, or the other one of two views.
+        """
         t, w = self.tracks, self.adjusted.inverse_depth
         good = np.bincount(t.track[self.adjusted.errors < CERTAIN], minlength=len(w))
-        return np.flatnonzero((good >= 2) & (w > 0))
+        return np.flatnonzero((good >= min(2, len(self.array.R) - 1)) & (w > 0))
 
     @property
     def w2c(self) -> Float64:

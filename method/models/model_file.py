@@ -67,7 +67,7 @@ def _digest(entry: str, tensors: Tensors) -> str:
     digest = hashlib.sha256(entry.encode())
     for name in sorted(tensors):
         digest.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())
-        digest.update(tensors[name].numpy().tobytes())
+        digest.update(tensors[name].reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy lacks some types
     return digest.hexdigest()
 
 

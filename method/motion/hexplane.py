@@ -27,7 +27,7 @@ from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.motion.mlp import perceptron
-from spike4dgs.method.settings import Settings
+from spike4dgs.method.settings import Settings, check_numbers
 from spike4dgs.method.splat import Splats
 
 SPATIAL_AXES = ((0, 1), (0, 2), (1, 2))  # the planes xy, xz, yz
@@ -50,6 +50,16 @@ class HexPlaneSettings(Settings):
     tv_weight: float = 2e-4  # the three weights of 4DGS's dynerf preset
     smooth_weight: float = 1e-3
     sparse_weight: float = 1e-4
+
+    def __post_init__(self) -> None:
+        wanted = {
+            "cell_px above 0": (self.cell_px, self.cell_px > 0),
+            "cell_ticks above 0": (self.cell_ticks, self.cell_ticks > 0),
+            "levels of 1 or more": (self.levels, self.levels >= 1),
+            "features of 1 or more": (self.features, self.features >= 1),
+            "mlp_width of 1 or more": (self.mlp_width, self.mlp_width >= 1),
+        }
+        check_numbers("motion", wanted)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from spike4dgs.method.gaussians.optimizer import Decay
 from spike4dgs.method.gaussians.parameters import Gaussians
 from spike4dgs.method.motion.base import Extent, Motion
 from spike4dgs.method.motion.coherence import CUBIC
-from spike4dgs.method.settings import Settings
+from spike4dgs.method.settings import Settings, check_numbers
 from spike4dgs.method.splat import Splats
 from spike4dgs.method.splat.kernels.jit import kernel
 from spike4dgs.method.splat.kernels.threads import ITEM, run_items
@@ -47,6 +47,10 @@ class PolynomialSettings(Settings):
     lr_times: float = 1e-3  # [1e-4]
     lr_temporal_scales: float = 0.03  # [0.03]
     lr_angular_velocities: float = 1e-3  # [1e-4]
+
+    def __post_init__(self) -> None:
+        scale = self.static_temporal_scale
+        check_numbers("motion", {"static_temporal_scale above 0": (scale, scale > 0)})
 
 
 class PolynomialMotion(Motion):

@@ -104,7 +104,7 @@ def solve_pose(
     if not size > 0:
         return None
     points, pixels = (np.ascontiguousarray(x, np.float64) for x in ((points - middle) / size, pixels))
-    cv2.setRNGSeed(seed)
+    cv2.setRNGSeed(seed % 2**31)  # a C int
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
             points,

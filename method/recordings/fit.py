@@ -141,6 +141,9 @@ def _fitted(
             raise problem(path, "no model, or one of this recording, method, budget and seed", found, fix)
         _say(console, "the model is there: only sheet, video and report are made again")
         return saved
+    for name in (SHEET, VIDEO, REPORT):  # of a model that was removed
+        (out / name).unlink(missing_ok=True)
+    shutil.rmtree(out / PREDICTIONS, ignore_errors=True)
     work = out / "work" / _key(about)[:16]
     with RunDisplay(console, 1) as display, display.cell(f"{about.name} on {about.scene}") as shown:
         watched = replace(request, progress=shown.progress)

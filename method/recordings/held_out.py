@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.measure import Values, scene_means, select_metrics
 from spike4dgs.benchmark.runs.held_out import SPIKE_METRICS, targets_of
 from spike4dgs.benchmark.runs.predictions import MethodInfo, PredictionInfo, PredictionWriter
@@ -47,16 +48,20 @@ def held_out_views(scene: Scene, fitted: TrainingScene, changed: Sequence[str], 
     """Return the views of the held-out cameras, beside the `fitted` scene, of which `changed` was estimated anew.
 
     Where that is "poses" or "clocks", a held-out camera's are estimated in the same way, from its own stream. Its clock
-    stays as given where that does not tell it, and where its light changes.
+    stays as given where that does not tell it, and where its light changes; both do where its stream cannot be read,
+    as in a training part.
     """
     views = {name: HeldOutView(scene.cameras[name]) for name in scene.test}
     for name, view in views.items() if changed else ():
-        stream = fill_gaps(scene.stream(name))
+        try:
+            stream, recordings = fill_gaps(scene.stream(name)), scene.recordings(name)
+        except UserError:
+            continue
         if "poses" in changed:
-            found = pose_of_another(fitted, view.camera, stream, scene.recordings(name), seed)
+            found = pose_of_another(fitted, view.camera, stream, recordings, seed)
             view = replace(view, camera=found)
         if "clocks" in changed and not light_changes([stream]):
-            told = clock_of_another(fitted, view.camera, stream, scene.recordings(name))
+            told = clock_of_another(fitted, view.camera, stream, recordings)
             if told.error_ticks <= LARGEST_ERROR_TICKS:
                 view = replace(view, clock=told.clock)
         views[name] = view

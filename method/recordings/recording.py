@@ -6,6 +6,7 @@ camera. The held-out cameras' streams and recordings are read after it, to judge
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +29,8 @@ from spike4dgs.method.starts.structure_from_motion import FEATURES, FOCAL_PRIOR,
 GIVEN = "given by the scene"
 ESTIMATED = "estimated with COLMAP, the focal length too: the unit of length is the array's largest distance"
 ALL = "all"  # the split of a recording without poses
+_FEWEST = 3  # streams without poses: COLMAP's mapping registers no two views
+_NO_ID = re.compile(r"[^A-Za-z0-9._-]+")
 LEAST_SIDE = 16  # pixels: views are matched at half their size, with windows of some pixels
 WHITE_PERCENTILE = 99.0  # of the mean rates; the rate of white is not known without a scene
 
@@ -69,16 +72,17 @@ def open_recording(root: Path, seed: int = 0) -> Recording:
 def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) -> Recording:
     """Return streams with the cameras that structure from motion finds; those that it does not find are left out."""
     kinds = {(s.width, s.height, s.rate_hz, s.n_ticks) for s in streams.values()}
-    if len(streams) < 2 or len(kinds) > 1:
+    if len(streams) < _FEWEST or len(kinds) > 1:
         found = f"{len(streams)} stream(s) of {len(kinds)} kind(s)"
-        raise problem(root, "two or more streams of one size, rate and length", found, "record all cameras together")
+        fix = "record all cameras together, or calibrate two with `spike4dgs calibrate-rig`"
+        raise problem(root, "three or more streams of one size, rate and length", found, fix)
     _check_size(root, streams.values())
     names = sorted(streams)
     first = streams[names[0]]
     clock = first.rate_hz, first.n_ticks
     surveyed = survey_streams(
         TrainingScene(
-            root.resolve().name,
+            _NO_ID.sub("-", root.resolve().name).strip("._-")[:100] or "streams",  # a scene's id, in the model's file
             streams_revision(streams),
             _guess(names, first),
             tuple(streams[c] for c in names),

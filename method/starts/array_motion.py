@@ -182,6 +182,8 @@ def _with_slopes(image: Float32, blur: float) -> Float32:
 
 def _sampled(image: Float32, uv: Float64) -> Float64:
     """Return the values [N, F] of an image [H, W, F] at pixel coordinates [N, 2]; NaN outside."""
+    if not len(uv):  # of a view on whose depths no other agrees; OpenCV takes no empty map
+        return np.empty((0, image.shape[-1]))
     across, down = (uv - 0.5).astype(np.float32).T[..., None]
     nothing = (np.nan,) * 4
     found = cv2.remap(image, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nothing)

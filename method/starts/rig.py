@@ -26,7 +26,7 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.images.recorded import Recorded
-from spike4dgs.method.settings import Settings
+from spike4dgs.method.settings import Settings, check_numbers
 from spike4dgs.method.starts.array_motion import find_path, may_move
 from spike4dgs.method.starts.base import Start
 from spike4dgs.method.starts.clip import Clip, ImageClip, SpikeClip
@@ -60,6 +60,13 @@ class PointSettings(CloudSettings, SweepSettings):
     """Numbers of points by plane sweep (prefix `initialization`)."""
 
     window_ticks: int = 40  # 2 ms at 20 kHz: a window within which things count as static
+
+    def __post_init__(self) -> None:
+        wanted = {
+            "window_ticks of 1 or more": (self.window_ticks, self.window_ticks >= 1),
+            "neighbours of 2 or more": (self.neighbours, self.neighbours >= 2),
+        }
+        check_numbers("initialization", wanted)
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ from spike4dgs.method.training_views.pinholes import undistorted
 if TYPE_CHECKING:  # its import takes over the handling of SIGTERM: left to those who use it
     import pycolmap
 
+_SEEDS = 2**31  # of COLMAP, whose seeds are C ints
+
 
 @dataclass(frozen=True)
 class FeatureSettings(Settings):
@@ -90,6 +92,7 @@ def find_features(
     with tempfile.TemporaryDirectory(prefix="spike4dgs-colmap-") as folder, _quiet():
         names = _write_images(Path(folder), cameras, images, settings.enlarge)
         database = Path(folder) / "database.db"
+        seed %= _SEEDS
         pycolmap.set_random_seed(seed)
         _extract(database, Path(folder), cameras, names, settings, focal_prior)
         _match(database, seed, settings)
@@ -234,7 +237,7 @@ def map_views(
 def _options(seed: int, min_angle_deg: float, *, refine_focal: bool) -> pycolmap.GlobalPipelineOptions:
     import pycolmap
 
-    options = pycolmap.GlobalPipelineOptions()
+    options, seed = pycolmap.GlobalPipelineOptions(), seed % _SEEDS
     options.num_threads, options.random_seed = 1, seed
     options.mapper.num_threads, options.mapper.random_seed = 1, seed
     options.mapper.min_tri_angle_deg = min_angle_deg

@@ -40,6 +40,7 @@ from torch.nn.functional import avg_pool2d
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.sensor_model import SENSOR
+from spike4dgs.method.settings import check_numbers
 from spike4dgs.method.supervision.base import Render, Sample, Supervision, difference
 from spike4dgs.method.supervision.pixel import PixelSettings
 
@@ -61,6 +62,14 @@ class FixedPatternSettings(PixelSettings):
     every: int = 10  # steps between two solutions
     first: int = 20  # step of the first solution: soon, before Gaussians take up the pattern
     ssim_weight: float = 0.05  # SSIM is all contrast: with 0.2 Gaussians take up the pattern of flat surfaces
+
+    def __post_init__(self) -> None:
+        wanted = {
+            "noise_px odd, of 1 or more": (self.noise_px, self.noise_px > 0 and self.noise_px % 2 == 1),
+            "memory of 1 step or more": (self.memory, self.memory >= 1),
+            "every of 1 step or more": (self.every, self.every >= 1),
+        }
+        check_numbers("supervision", wanted)
 
 
 class FixedPattern(Supervision):

@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from spike4dgs.benchmark.scene.scene import TrainingScene
-from spike4dgs.method.settings import Settings
+from spike4dgs.method.settings import Settings, check_numbers
 from spike4dgs.method.supervision.base import Render, Sample, Supervision
 from spike4dgs.method.supervision.spike_cameras import SpikeCameras, random_charge, recorded
 from spike4dgs.method.training_views.training_images import known
@@ -91,6 +91,13 @@ class SpikeSettings(Settings):
 
     spike_ticks: int = 40  # ticks of a recorded window, as many as TFP's has
     neuron_ticks: int = 256  # for which a neuron sees a rendered image: SpikeNeRF's; closed form, so they cost nothing
+
+    def __post_init__(self) -> None:
+        wanted = {
+            "spike_ticks of 1 or more": (self.spike_ticks, self.spike_ticks >= 1),
+            "neuron_ticks of 1 or more": (self.neuron_ticks, self.neuron_ticks >= 1),
+        }
+        check_numbers("supervision", wanted)
 
 
 class SpikeRate(Supervision):

@@ -106,6 +106,7 @@ class Corrections:
         self._stopped.set()
         if self._thread.ident:
             self._thread.join()
+        self._ahead = iter(())  # what is left holds the fit, and all its images
 
     def _make(self, index: int, views: Sequence[int]) -> None:
         """Make what neither thread has begun. An error is raised where the image is asked for."""

@@ -15,10 +15,10 @@ from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.starts.dust3r import estimate as estimate_dust3r
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import write_json
+from spike4dgs.benchmark.files import check_writable, write_json
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
+from spike4dgs.benchmark.scene.scene import TrainingScene, open_scenes
 from spike4dgs.method.msdi.pose import solve_poses
 from spike4dgs.method.starts.clip import window_means
 from spike4dgs.method.starts.matching import match_and_solve, refined_poses
@@ -118,9 +118,10 @@ def poses(
         raise problem("--initialization", expected, ", ".join(unknown), "correct the names")
     if images not in (CLIP, FLAT, *IMAGES):
         raise problem("--images", f"one of {', '.join((CLIP, FLAT, *IMAGES))}", repr(images), "correct the name")
-    rows = []
-    for path in scenes:
-        scene = as_pinholes(open_scene(path, allow_gaps, split).training)
+    opened, rows = open_scenes(scenes, allow_gaps, split), []
+    if out:
+        check_writable(out.parent)
+    for scene in (as_pinholes(one.training) for one in opened):
         made = _images(scene, images)
         for name in initialization:
             rows.append(measure_poses(scene, made, name, seed, calibrated=not unknown_intrinsics))
@@ -130,7 +131,7 @@ def poses(
     if out:
         settings = {"images": images, "unknown_intrinsics": unknown_intrinsics, "seed": seed}
         write_json(out, {"settings": settings, "rows": rows})
-    return 0
+    return 1 if any("error" in row for row in rows) else 0
 
 
 def _images(scene: TrainingScene, images: str) -> Float32:

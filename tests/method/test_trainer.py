@@ -11,7 +11,7 @@ from hard_case import BYTES, HardCase
 from toy_fits import MOTIONS, SMALL_PLANES, WORLD, checkpoints, method, request, silent, surfaces, trainer
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import Budget
+from spike4dgs.benchmark.method import Budget, get_method
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.images.training import ImageSettings, choose_ticks
 from spike4dgs.method.models.fitted_model import FittedModel
@@ -19,6 +19,7 @@ from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, stage
 from spike4dgs.method.settings import as_dict, in_budget, make_settings, override
 from spike4dgs.method.splat import render
 from spike4dgs.method.starts.base import measure
+from spike4dgs.method.supervision.spike import SpikeSettings
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.instants import Corrections, correction, node
@@ -280,6 +281,37 @@ def test_settings_are_overridden_and_recorded_by_part():
     assert set(settings) == {"images", "initialization", "motion", "supervision", "trainer", "density"}
     found = override({"images": ImageSettings()}, {"images.max_times": 9}, "here")
     assert found == {"images": ImageSettings(max_times=9)}
+
+
+@pytest.mark.parametrize(
+    ("recipe", "name", "value"),
+    [
+        ("spike4dgs-x+self-calibrated", "supervision.every", 0),
+        ("spike4dgs-x+self-calibrated", "supervision.noise_px", 4),
+        ("spike4dgs-x+self-calibrated", "supervision.memory", 0),
+        ("tfp+stg", "motion.static_temporal_scale", 0.0),
+        ("tfp+4dgs", "motion.levels", 0),
+        ("tfp+4dgs", "motion.features", 0),
+        ("tfp+4dgs", "motion.mlp_width", 0),
+        ("tfp+4dgs", "motion.cell_px", 0.0),
+        ("tfp+4dgs", "motion.cell_ticks", -1.0),
+        ("spike4dgs-x", "initialization.window_ticks", 0),
+        ("spike4dgs-x", "initialization.neighbours", 1),
+        ("spike4dgs-x", "trainer.beta1", 1.0),
+        ("spike4dgs-x", "trainer.beta2", -0.1),
+        ("spike4dgs-x", "trainer.coarse_share", 3.0),
+    ],
+)
+def test_numbers_that_no_fit_can_use_are_refused_before_it(recipe, name, value):
+    part, _, setting = name.partition(".")
+    with pytest.raises(UserError, match=f"settings of {part}: expected {setting} .*, found {value}"):
+        get_method(recipe).with_settings({name: value}, "mine")
+
+
+def test_spikes_of_no_ticks_are_refused():
+    for name in ("spike_ticks", "neuron_ticks"):
+        with pytest.raises(UserError, match=f"settings of supervision: expected {name} of 1 or more, found 0"):
+            SpikeSettings(**{name: 0})
 
 
 def test_budget_scales_steps_only():

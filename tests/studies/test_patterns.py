@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import find_methods, training_for
 from spike4dgs.benchmark.scene.calibration import Calibration, Recordings
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
@@ -86,6 +87,12 @@ def test_command_writes_maps_and_their_errors(recorded, small_scene: Path, tmp_p
         for row, right in zip(rows.values(), expected, strict=True):
             assert row == pytest.approx(right, rel=1e-4)
     assert str(out) in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_place_that_cannot_be_written_is_told_before_the_fit(small_scene: Path, monkeypatch) -> None:
+    monkeypatch.setattr(pattern_report, "METHODS", {})
+    with pytest.raises(UserError, match="/proc/nowhere/pattern-0: expected"):
+        pattern_report.patterns(small_scene, out=Path("/proc/nowhere"))
 
 
 def test_the_fit_gets_no_recordings(small_scene: Path) -> None:

@@ -47,7 +47,8 @@ def test_cameras_at_one_place_are_a_row_with_a_reason(monkeypatch: pytest.Monkey
 def test_command_prints_and_writes_the_table(small_scene: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "poses.json"
     arguments = ["poses", str(small_scene), "--initialization", "rig", "colmap", "--images", "tfp", "--out", str(out)]
-    assert main(arguments) == 0
+    arguments += ["--seed", str(2**62)]  # COLMAP's are C ints
+    assert main(arguments) == 1, "an estimator failed"
     rows = json.loads(out.read_text())["rows"]
     assert [r["initialization"] for r in rows] == ["rig", "colmap"] and rows[0]["rotation_deg"] < 1e-6
     assert rows[1]["registered"] == "0 of 3"  # a pattern without parallax that is another one in each view
@@ -75,3 +76,11 @@ def test_unknown_names_are_refused(small_scene: Path) -> None:
         poses((small_scene,), initialization=("sift",))
     with pytest.raises(UserError, match="one of clip, flat, tfp"):
         poses((small_scene,), images="photo")
+    with pytest.raises(UserError, match="at least one scene folder, found none"):
+        poses(())
+
+
+def test_a_place_that_cannot_be_written_is_told_before_the_work(small_scene: Path, monkeypatch) -> None:
+    monkeypatch.setattr("spike4dgs.studies.poses.estimators.measure_poses", None)
+    with pytest.raises(UserError, match="/proc/nowhere: expected"):
+        poses((small_scene,), out=Path("/proc/nowhere/poses.json"))

@@ -150,6 +150,13 @@ def test_the_focal_length_is_found_too() -> None:
     assert solved.array.K[0, 0, 0] == pytest.approx(220, rel=0.03)
 
 
+def test_two_views_have_points() -> None:
+    rng = np.random.default_rng(8)
+    true = true_array(2, rng, baseline=0.3)
+    solved = solve(matches_of(true, rng, noise=0.1), true.K)
+    assert solved is not None and len(solved.points_kept()) > 50
+
+
 def test_too_few_matches_give_no_pose() -> None:
     rng = np.random.default_rng(7)
     true = true_array(3, rng)

@@ -194,6 +194,13 @@ def test_a_file_that_was_cut_off_is_refused(saved: Path, share: float) -> None:
     refused(saved, r"m\.safetensors: expected a fitted model, found damaged data .*run-benchmark")
 
 
+def test_a_tensor_of_a_type_that_numpy_lacks_is_refused(tmp_path: Path) -> None:
+    metadata = {"schema": "spike4dgs-model/1", "about": "{}", "sha256": "0" * 64}
+    path = tmp_path / "m.safetensors"
+    safetensors.torch.save_file({"a.b": torch.zeros(3, dtype=torch.bfloat16)}, path, metadata=metadata)
+    refused(path, "expected the SHA-256 that it was written with, found damaged data")
+
+
 def test_what_is_no_model_is_refused(saved: Path, tmp_path: Path) -> None:
     refused(tmp_path / "none", "none: expected a fitted model, found no such file; run-benchmark writes OUT/models")
     refused(tmp_path, r"expected a model's file, found a folder \(models in it: m.safetensors\); name one file")

@@ -27,6 +27,7 @@ from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import FitRequest, get_method, make_budget
 from spike4dgs.benchmark.metrics.pose_error import align_cameras, pose_errors
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.runs.record import read_record
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
@@ -38,7 +39,7 @@ from spike4dgs.cli import main
 from spike4dgs.method import load_model
 from spike4dgs.method.recordings import fit as fit_module
 from spike4dgs.method.recordings.fit import MODEL, PREDICTIONS, REPORT, SHEET, VIDEO
-from spike4dgs.method.recordings.held_out import SHOWN
+from spike4dgs.method.recordings.held_out import SHOWN, HeldOutView, held_out_views
 from spike4dgs.method.recordings.recording import open_recording, own_frame, streams_revision
 
 WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)
@@ -185,6 +186,22 @@ def test_no_file_of_truth_is_read(tmp_path: Path, no_sheet: None, capsys: pytest
     assert "held-out cam_03 by their own spikes: no score (not computed: the stream or the recordings of cam_03" in said
 
 
+def test_a_held_out_camera_whose_stream_is_kept_back_is_taken_as_given(small_scene: Path, tmp_path: Path) -> None:
+    part = write_training_part(open_scene(small_scene), tmp_path / "part")
+    (view,) = held_out_views(part, part.training, ("poses", "clocks"), 0).values()
+    assert view == HeldOutView(part.cameras["cam_03"])
+
+
+def test_nothing_of_a_model_that_was_removed_stays_beside_a_new_one(fitted: Path, recorded: Path, tmp_path) -> None:
+    out = Path(shutil.copytree(fitted, tmp_path / "out"))
+    (out / MODEL).unlink()
+    (out / PREDICTIONS).mkdir(exist_ok=True)
+    (out / PREDICTIONS / "prediction.json").write_text("{}")
+    arguments = ["fit", str(recorded), "--method", "nearest-view", "--out", str(out), "--poses", "given"]
+    assert main(arguments) == 2, "its models cannot be saved"
+    assert not [path.name for path in out.iterdir() if path.name not in (".lock", "work")]
+
+
 def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, no_sheet: None, capsys) -> None:
     bare = write_small_scene(tmp_path / "scene")
     for name in ("images", "masks"):
@@ -217,13 +234,15 @@ def test_the_revision_of_streams_is_that_of_their_description_too(tmp_path: Path
 
 
 def test_streams_without_poses_get_estimated_ones(tmp_path: Path, no_sheet: None, capsys) -> None:
-    write_stream_folder(tmp_path / "streams", write_streams(tmp_path / "streams"))
+    folder = tmp_path / "_my streams, ä"  # a model's file names it
+    write_stream_folder(folder, write_streams(folder))
     out = tmp_path / "out"
-    arguments = ["fit", str(tmp_path / "streams"), "--method", "tfp+4dgs", "--out", str(out), *QUICK]
+    arguments = ["fit", str(folder), "--method", "tfp+4dgs", "--out", str(out), *QUICK]
     assert main(arguments) == 0
     said = capsys.readouterr().out
     assert "poses: estimated with COLMAP" in said and "white is taken to be" in said
     assert "estimated with COLMAP" in (out / REPORT).read_text()
+    assert load_model(out / MODEL).provenance.scene == "my-streams"
     found = load_model(out / MODEL).provenance.cameras
     errors = pose_errors(found, WORLD.training.cameras).summary()
     assert errors["rotation_max_deg"] < 1.5 and errors["translation_max_m"] < 0.05
@@ -255,12 +274,13 @@ def test_streams_that_do_not_belong_together_or_are_dark_are_refused(tmp_path: P
         write_stream_folder(tmp_path, streams)
 
     write(8, a=8, b=9)
-    with pytest.raises(UserError, match="two or more streams of one size, rate and length"):
+    with pytest.raises(UserError, match="three or more streams of one size, rate and length"):
         open_recording(tmp_path)
-    write(8, a=8)
-    with pytest.raises(UserError, match=r"found 1 stream\(s\)"):
-        open_recording(tmp_path)
-    write(64, a=8, b=8)
+    for few in ({"a": 8}, {"a": 8, "b": 8}):  # COLMAP registers no two views
+        write(8, **few)
+        with pytest.raises(UserError, match=rf"found {len(few)} stream\(s\)"):
+            open_recording(tmp_path)
+    write(64, a=8, b=8, c=8)
     with pytest.raises(UserError, match="expected two cameras that recorded spikes, in most ticks, found 0"):
         open_recording(tmp_path)
 

@@ -14,7 +14,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Recipe
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.recipes import METHODS
-from spike4dgs.method.starts.array_motion import Explained
+from spike4dgs.method.starts.array_motion import Explained, _sampled
 from spike4dgs.method.starts.base import Initialization, Start
 from spike4dgs.method.starts.rig import RigSettings, rig
 
@@ -50,6 +50,15 @@ def test_the_path_is_found_to_a_fraction_of_a_pixel(start):
 def test_it_is_said_in_one_line(start, said):
     text = said.getvalue()
     assert text.startswith(f"{WORLD.training.id}: the array moves, the image by ") and text.count("\n") == 1
+
+
+def test_a_view_on_whose_depths_no_other_agrees_has_no_say():
+    image = np.random.default_rng(0).random((8, 9, 3)).astype(np.float32)
+    assert _sampled(image, np.empty((0, 2))).shape == (0, 3)
+    dark = replace(WORLD.training.streams[3], packed=np.zeros_like(WORLD.training.streams[3].packed))
+    streams = (*WORLD.training.streams[:3], dark, *WORLD.training.streams[4:])
+    found = rig(replace(WORLD.training, streams=streams), FOLLOWS)
+    assert np.isfinite(found.points).all() and len(found.points) > 100
 
 
 def test_an_array_that_stands_still_has_no_path_and_the_same_start(capsys):

@@ -2,7 +2,8 @@
 
 import math
 import threading
-from collections.abc import Sequence
+import weakref
+from collections.abc import Iterator, Sequence
 
 import pytest
 import torch
@@ -213,3 +214,23 @@ def test_a_span_holds_the_whole_number_of_spikes_that_comes_nearest_to_the_model
     expected = one * torch.tensor([nan, 0, 0, 0, nan, nan, 1, 2, 3, nan, nan]) - counted
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0, equal_nan=True)
     assert not recount(torch.full((1, 2, 2), 0.3), torch.zeros(1, 4, 2, 2).half()).any(), "nothing is in doubt"
+
+
+def test_what_was_not_made_ahead_holds_nothing_after_the_end() -> None:
+    """A fit hands in a generator that holds it, with all its images."""
+
+    class Held:
+        def requests(self) -> Iterator[tuple[int, list[int]]]:
+            for index in range(9):
+                yield index, [0]
+
+    held = Held()
+    gone = weakref.ref(held)
+    corrections = Corrections(Spans(torch.zeros(9, 1, 2, 2, 2), 5.0, 99), lambda index: lambda views: None)  # type: ignore[arg-type,return-value]
+    corrections._stopped.set()  # the helper thread makes nothing of it
+    requests = held.requests()
+    next(requests)
+    corrections.begin(requests)
+    corrections.stop()
+    del held, requests
+    assert gone() is None

@@ -225,3 +225,9 @@ def test_speed_render_puts_models_side_by_side(tmp_path: Path, capsys: pytest.Ca
     for row in rows[:2]:
         assert float(row["min ms"]) <= float(row["median ms"])
         assert float(row["frames/s"]) == pytest.approx(1e3 / float(row["median ms"]), rel=0.05)
+
+
+def test_where_no_video_can_be_written_the_system_says_why() -> None:
+    with pytest.raises(UserError) as told, video_writer(Path("/proc/v.avi"), (48, 32), 10):
+        pass
+    assert "/proc/v.avi" in str(told.value) and "encoder" not in str(told.value)
