@@ -62,7 +62,7 @@ def kept(path: Path, key: object, make: Callable[[], Float32]) -> Float32:
     """Return the array of a file of the same key, or make it and write the file."""
     own = sha256_json(key)
     try:
-        with np.load(path) as file:
+        with open(path, "rb") as opened, np.load(opened) as file:  # NumPy leaves a damaged one open
             if str(file["key"]) == own:
                 return np.asarray(file["images"])
     except (OSError, KeyError, ValueError, EOFError, BadZipFile):
