@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -145,6 +146,21 @@ class ReadsPath(CountMethod):
     def fit(self, scene: TrainingScene, request: FitRequest) -> Any:
         self._path.read_bytes()
         return super().fit(scene, request)
+
+
+class DiesBesideItsChild(CountMethod):
+    """Dies while a child of its own, which holds its pipes, goes on."""
+
+    def __init__(self, child: Path) -> None:
+        super().__init__("dies")
+        self._child = child
+
+    def fit(self, scene: TrainingScene, request: FitRequest) -> Any:
+        if (child := os.fork()) == 0:
+            time.sleep(300)
+            os._exit(0)
+        self._child.write_text(str(child))
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 class LacksWeights(CountMethod):

@@ -10,8 +10,10 @@ takes the command that starts one.
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import select
 import shlex
 import shutil
 import subprocess
@@ -60,6 +62,7 @@ _HIDDEN = (RELEASE, "OLDPWD", *TOKENS.values())  # variables that tell where sce
 _FOLDERS = ("SPIKE4DGS_", "TORCH_HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR")  # beginnings of variables of folders
 _WORDS = ("SPIKE4DGS_MITSUBA_VARIANT",)  # that begin so and name none
 _END_S = 5.0  # for a process to end by itself
+_POLL_S = 0.5  # without a line, until one looks whether it still runs
 WORK, PART = "{work}", "{part}"  # in a container's command
 
 
@@ -168,7 +171,7 @@ class _Child:
 
         Raises FitFailed with the failure that it reports, UserError where it ends or says anything else.
         """
-        while line := cast(IO[bytes], self._process.stdout).readline(MOST):
+        while line := self._line():
             kind, value = parse_line(line, self.where)
             try:
                 if kind == PROGRESS:
@@ -186,6 +189,15 @@ class _Child:
             except (TypeError, ValueError, KeyError) as e:
                 raise problem(self.where, f"the line {wanted}", f"{type(e).__name__}: {e}", "correct the method") from e
         raise self._ended()
+
+    def _line(self) -> bytes:
+        """Return the next line; none at the end, and where the process has died while a child of its own goes on."""
+        # Without the buffer, of which `select` knows nothing.
+        pipe = cast(io.RawIOBase, cast(io.BufferedReader, self._process.stdout).raw)
+        while os.name == "posix" and not select.select([pipe], [], [], _POLL_S)[0]:
+            if self._process.poll() is not None:
+                return b""
+        return pipe.readline(MOST)
 
     def _ended(self) -> Exception:
         with suppress(subprocess.TimeoutExpired):

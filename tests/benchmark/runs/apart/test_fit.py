@@ -16,7 +16,7 @@ import nosy_methods
 import pytest
 from changes import edit_json, files_in
 from dummy_methods import CountMethod, FailingMethod, WorkerKiller, prediction_bytes, run, wait_for, without_timings
-from nosy_methods import LacksWeights, LooksAround, PlaysBack, Refines, Swaps
+from nosy_methods import DiesBesideItsChild, LacksWeights, LooksAround, PlaysBack, Refines, Swaps
 from rich.console import Console
 from small_scenes import write_small_scene
 
@@ -211,6 +211,13 @@ def test_a_process_that_is_killed_fails_its_cell_and_the_next_run_goes_on(small_
     run(tmp_path / "whole", [small_scene], CountMethod("killer"), **PSNR)
     same = "predictions/killer/pattern-0"
     assert prediction_bytes(tmp_path / "out" / same) == prediction_bytes(tmp_path / "whole" / same)
+
+
+def test_a_process_that_dies_beside_its_own_child_holds_nobody(small_scene: Path, tmp_path: Path) -> None:
+    child = tmp_path / "child"
+    cell = cell_of(run(tmp_path / "out", [small_scene], DiesBesideItsChild(child), **APART))
+    assert cell["status"] == "failed" and "its end by signal 9" in cell["error"]
+    os.kill(int(child.read_text()), signal.SIGKILL)  # it still ran
 
 
 def caller(out: Path, scene: Path, folder: Path) -> subprocess.Popen[bytes]:
