@@ -30,8 +30,8 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
     opened = open_scene(scene, allow_gaps=True)  # the clip itself, which may have gaps, is not used
     with locked(out / ".lock", out, "a folder that no other calibration writes to", temporary=True):
         remove_parts(out)
-        kept = [c for c in opened.cameras.values() if c.id in opened.meta["streams"]]  # a training part keeps some back
-        rows = [_calibrated(opened, camera, scene, out) for camera in kept]
+        given = [opened.cameras[c] for c in opened.meta["streams"]]  # a training part keeps the others back
+        rows = [_calibrated(opened, camera, scene, out) for camera in given]
     columns = "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
     show_table("", columns, rows, None)
     print(f"maps and images: {out}")

@@ -38,7 +38,7 @@ from spike4dgs.benchmark.reports.paper_tables import (
 from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.record import Record, of_scenes
 from spike4dgs.benchmark.runs.refinement import SUFFIX
-from spike4dgs.benchmark.runs.run import Settings
+from spike4dgs.benchmark.runs.run import Settings, split_folder
 from spike4dgs.benchmark.scene.scene import open_scene, open_scenes
 from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
@@ -199,7 +199,7 @@ def _run(
         opened = open_scenes(scenes, allow_gaps, split)
         if not runs and (line := release_line(opened)):
             console.print(line, highlight=False, markup=False)
-        out = fits.out / split if split and not all(s.is_default_split for s in opened) else fits.out
+        out = split_folder(fits.out, split, opened)
         chosen = (fits.metrics, fits.seeds, fits.workers, fits.scheduler, fits.refit)
         apart = None if fits.in_process else Apart()
         settings = Settings(out, fits.seed, device, budget, *chosen, typical_fit_seconds(), apart)
@@ -248,13 +248,14 @@ def _with_neighbours(scenes: tuple[Path, ...], run: SplitRun, allow_gaps: bool) 
     given = {s.id for s in run.scenes}
     of_all = [(scene, r["dataset"]) for r in run.records for scene in r["scenes"] if scene not in given]
     kept = {(scene, of["scenes"][scene], of["split"]) for scene, of in of_all}
-    found = {scenes[0].parent / kept_one[0] for kept_one in kept if _is_there(scenes[0].parent, *kept_one, allow_gaps)}
+    data = scenes[0].parent
+    found = {data / scene for scene, revision, split in kept if _is_there(data / scene, revision, split, allow_gaps)}
     return (*scenes, *sorted(found))
 
 
-def _is_there(data: Path, scene: str, revision: str, split: str, allow_gaps: bool) -> bool:
+def _is_there(path: Path, revision: str, split: str, allow_gaps: bool) -> bool:
     try:
-        return open_scene(data / scene, allow_gaps, split).revision == revision
+        return open_scene(path, allow_gaps, split).revision == revision
     except UserError:
         return False
 

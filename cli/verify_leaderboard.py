@@ -40,8 +40,7 @@ def verify_leaderboard(
     With predictions and scenes, entries whose files are there are also scored again, and the verification that they
     state is compared with the result. If an entry's predictions are there but are not its own, a line says why they are
     passed over. Second renderings of a target take half a minute per scene. With --refit, entries that are labelled
-    re-fitted are fitted again.
-    Problems are listed on stderr, and the exit code is then 1.
+    re-fitted are fitted again. Problems are listed on stderr, and the exit code is then 1.
 
     Args:
         leaderboard: Leaderboard folder.

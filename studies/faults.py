@@ -22,7 +22,7 @@ from spike4dgs.benchmark.files import read_json, sha256_json, write_json, write_
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, FitRequest, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import mean, score_image
 from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_figure
-from spike4dgs.benchmark.runs.method_code import code_of
+from spike4dgs.benchmark.runs.apart.messages import identity
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.generators.recorder.emulation.imperfections import Imperfections
@@ -133,7 +133,7 @@ def fault_table(
             wanted = get_method(method)
             request = FitRequest(make_budget(budget), chosen, seed)
             run = partial(fit_recording, capture / "clip", wanted, folder, request, TFP)
-            by = sha256_json({"params": dict(getattr(wanted, "params", {})), "code": code_of(wanted)})
+            by = sha256_json(identity(wanted))
             found.append(Outcome(case, method, **_scored(run, folder, shown, by)))
             _write(out, found, about)
     print(f"table: {out}/{{table.md,table.csv,table.json,table.png}}")

@@ -28,7 +28,7 @@ from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.record import Record
-from spike4dgs.benchmark.runs.run import Settings, run_matrix
+from spike4dgs.benchmark.runs.run import Settings, run_matrix, split_folder
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.studies.kit.timing import markdown, write_csv
 from spike4dgs.studies.oracle_methods import Ladder, oracle_ladders
@@ -78,7 +78,7 @@ def oracle_ladder(
         allow_gaps: Accept recordings with gaps.
     """
     opened, console = open_scenes(scenes, allow_gaps, split), make_console()
-    out = out / split if split and not all(s.is_default_split for s in opened) else out
+    out = split_folder(out, split, opened)
     ladders = oracle_ladders(methods, out / "truth", samples)
     if scheduler is None or device == "auto":
         device = choose_device_for([rung.method for ladder in ladders for rung in ladder.rungs], device)

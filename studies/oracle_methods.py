@@ -106,7 +106,7 @@ class OracleMethod:
         """Fit the training views and the truth of this scene and revision, which must be in the folder."""
         truth = Truth.of(self.root, scene.id, scene.revision, self.samples)
         if "calibration" in self.oracle:
-            scene = with_calibrations(scene, truth.calibrations(scene.radiance_gain))
+            scene = replace(scene, known_calibrations=truth.calibrations(scene.radiance_gain))
         recipe, parts = self._recipe, PARTS
         if "images" in self.oracle:
             true = TrueImages(truth=truth, streams=scene.streams)
@@ -188,11 +188,6 @@ class TrueImages(ImageMaker):
     @cached_property
     def _read(self) -> dict[tuple[int, ...], Float32]:
         return {}
-
-
-def with_calibrations(scene: TrainingScene, calibrations: tuple[Calibration, ...]) -> TrainingScene:
-    """Return a scene whose cameras' responses to light are given, in the place of estimates from their recordings."""
-    return replace(scene, known_calibrations=calibrations)
 
 
 def true_points(surfaces: Surfaces, request: StartRequest) -> Start:

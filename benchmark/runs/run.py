@@ -75,6 +75,11 @@ class Settings:
         return self.out if seed == self.seed else self.out / f"seed-{seed}"
 
 
+def split_folder(out: Path, split: str | None, scenes: Sequence[Scene]) -> Path:
+    """Return the folder of a run: OUT/SPLIT of a split that is named and not the default of its scenes, else OUT."""
+    return out / split if split and not all(scene.is_default_split for scene in scenes) else out
+
+
 def predictions_folder(out: Path, method: str, scene: str) -> Path:
     """Return the folder in which a run keeps the predictions of a cell."""
     return out / "predictions" / method / scene

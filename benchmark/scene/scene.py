@@ -72,11 +72,10 @@ class TrainingScene(Shown):
     @cached_property
     def calibrations(self) -> tuple[Calibration, ...] | None:
         """Each camera's response to light, from its recordings and its state; None unless all have recordings."""
-        found, recorded = self.known_calibrations, [r for r in self.recordings if r is not None]
-        if not found:
-            if not recorded or len(recorded) < len(self.cameras):
-                return None
-            found = tuple(map(estimate, recorded))
+        recorded = [r for r in self.recordings if r is not None]
+        if not self.known_calibrations and (not recorded or len(recorded) < len(self.cameras)):
+            return None
+        found = self.known_calibrations or tuple(map(estimate, recorded))
         return tuple(c.in_dark_of(self.state(s.id).dark) for s, c in zip(self.cameras, found, strict=True))
 
     @property

@@ -107,10 +107,15 @@ def check_splits(meta: Mapping[str, Any], cameras: Mapping[str, Camera], path: P
             raise problem(path, f"cameras of {size[0]}x{size[1]} pixels", found, _AGAIN)
 
 
+def splits_of(meta: Mapping[str, Any]) -> dict[str, Split]:
+    """Return the splits that scene.json states, by name."""
+    return {name: Split(tuple(s["train"]), tuple(s["test"])) for name, s in meta["splits"].items()}
+
+
 def read_targets(path: Path, meta: dict[str, Any]) -> dict[str, tuple[Target, ...]]:
     """Read the targets of every split: splits that hold out the same cameras as the default one have its targets."""
     data = read_json(path, "the scored images")
-    splits = {name: Split(tuple(s["train"]), tuple(s["test"])) for name, s in meta["splits"].items()}
+    splits = splits_of(meta)
     held_out = splits[meta["default_split"]].test
     try:
         default = _parse_targets(data["targets"])

@@ -11,7 +11,7 @@ from typing import Any
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
-from spike4dgs.benchmark.scene.splits import Split
+from spike4dgs.benchmark.scene.splits import Split, splits_of
 from spike4dgs.benchmark.spikes.counted_recording import raw
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.untrusted import MAX_GAIN
@@ -67,8 +67,12 @@ class Truth:
 
     def __or__(self, other: Truth) -> Truth:
         """Return the union; `other` has precedence."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in ("extras", "files", "splits"))
-        return Truth(self.targets + other.targets, *({**mine, **theirs} for mine, theirs in pairs))
+        return Truth(
+            self.targets + other.targets,
+            {**self.extras, **other.extras},
+            {**self.files, **other.files},
+            {**self.splits, **other.splits},
+        )
 
 
 @dataclass(frozen=True)
@@ -179,7 +183,7 @@ def truth(scene: Scene | None, n_ticks: int) -> Truth:
         targets=tuple(t for t in dict.fromkeys(targets) if t.tick < n_ticks),
         extras={name: scene.meta[name] for name in _EXTRAS if name in scene.meta},
         files={name: scene.manifest.path(name) for name in names},
-        splits={name: Split(tuple(s["train"]), tuple(s["test"])) for name, s in scene.meta["splits"].items()},
+        splits=splits_of(scene.meta),
     )
 
 

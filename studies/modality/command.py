@@ -28,7 +28,7 @@ from spike4dgs.benchmark.reports.figure import method_color, new_figure, save_fi
 from spike4dgs.benchmark.reports.scatter import label_points
 from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.record import Record
-from spike4dgs.benchmark.runs.run import Settings, run_matrix
+from spike4dgs.benchmark.runs.run import Settings, run_matrix, split_folder
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.studies.kit.timing import markdown, write_csv
 from spike4dgs.studies.sensors import BITS_OF_A_PIXEL, BITS_OF_AN_EVENT, bits_per_second, sensors_of
@@ -102,8 +102,7 @@ def modality(
     opened, console = open_scenes(scenes, split=split), make_console()
     methods = [get_method(name) for name in ROWS]
     chosen = choose_device_for(methods, device)
-    if split and not all(scene.is_default_split for scene in opened):
-        out = out / split
+    out = split_folder(out, split, opened)
     settings = Settings(out, seed, chosen, make_budget(budget), ("psnr",), seeds, workers, apart=Apart())
     rows = compare(opened, methods, settings, console)
     failed = [f"{row.method} on {scene}: {why}" for row in rows for scene, why in row.errors.items()]

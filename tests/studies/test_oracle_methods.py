@@ -31,7 +31,6 @@ from spike4dgs.studies.oracle_methods import (
     TrueImages,
     oracle_ladders,
     true_points,
-    with_calibrations,
 )
 from spike4dgs.studies.oracle_truth import Surfaces, Truth
 
@@ -127,7 +126,7 @@ def test_velocities_are_shared_out_over_the_pieces_of_a_long_clip(truth: Truth) 
 
 
 def test_true_calibrations_take_the_place_of_estimates(truth: Truth) -> None:
-    given = with_calibrations(SCENE, truth.calibrations(GAIN))
+    given = replace(SCENE, known_calibrations=truth.calibrations(GAIN))
     assert SCENE.calibrations is None and given.calibrations is not None
     camera: Calibration = given.calibrations[1]
     bent = replace(given, cameras=tuple(replace(c, distortion=(-0.1, 0, 0, 0, 0)) for c in given.cameras))
