@@ -131,7 +131,9 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         rows, without = (rows_under(names, c, own) for c in (condition, condition.absent))
         if any(row.is_complete for row in rows):
             changes = map(change_text, rows, without)
-            lines.append([condition.name, f"`{condition.options}`", *changes, _ceiling(condition, records)])
+            # Each option is code of its own, so that a narrow column breaks between them.
+            options = f"`{condition.options}`".replace(" --", "` `--")
+            lines.append([condition.name, options, *changes, _ceiling(condition, records)])
     heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names), _NOISE)
     legend = (
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
