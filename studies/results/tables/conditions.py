@@ -131,9 +131,7 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
         rows, without = (rows_under(names, c, own) for c in (condition, condition.absent))
         if any(row.is_complete for row in rows):
             changes = map(change_text, rows, without)
-            # Each option is code of its own, so that a narrow column breaks between them.
-            options = f"`{condition.options}`".replace(" --", "` `--")
-            lines.append([condition.name, options, *changes, _ceiling(condition, records)])
+            lines.append([condition.name, _code(condition.options), *changes, _ceiling(condition, records)])
     heads = ("condition", "options of `make-dataset`", *(f"`{name}`" for name in names), _NOISE)
     legend = (
         f"Whole image / where things move, dB; means of {' and '.join(WORLDS)}. The first row lists PSNR, the "
@@ -146,6 +144,11 @@ def conditions_block(records: Sequence[Record]) -> list[str]:
 def of_conditions(records: Sequence[Record]) -> list[Record]:
     """Return the records of all conditions."""
     return [record for group in EVERY for record in of_group(group, records)]
+
+
+def _code(options: str) -> str:
+    # Options of `make-dataset` are code each, so that a narrow column breaks between them.
+    return f"`{options.replace(' --', '` `--') if options.startswith('--') else options}`"
 
 
 def _ceiling(condition: Condition, records: Sequence[Record]) -> str:

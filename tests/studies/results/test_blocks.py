@@ -360,7 +360,7 @@ def test_a_condition_that_was_made_in_one_world_is_compared_with_that_world():
     assert moves.worlds == ("car-1",) and moves.name.endswith("car-1 alone")
     found = [record(OURS, s, psnr) for s, psnr in zip(CONDITIONS[0].scenes, (30.0, 50.0), strict=True)]
     found += [record(OURS, moves.scenes[0], 28.0)]
-    assert conditions_block(found)[3].endswith(f"| `{moves.options}` | -2.00 / -2.00 | - |")
+    assert conditions_block(found)[3].endswith("| `--array-motion 2` `--array-rotation 60` | -2.00 / -2.00 | - |")
 
 
 def test_what_breaks_a_row_is_the_mildest_amount_that_costs_three_decibels():
