@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -73,6 +74,13 @@ def check_writable(folder: Path) -> None:
         probe.unlink()
 
 
+def check_file(out: Path) -> None:
+    """Raise UserError where no file `out` can be written: before long work, not after it. Its folder is made."""
+    if out.is_dir():
+        raise problem("--out", "the name of a file", f"the folder {out}", "name a file in it")
+    check_writable(out.parent)
+
+
 def failure_of(error: OSError, path: Path | str) -> UserError | None:
     """Return what the system said while `path` was written as a UserError; None for an error that is the program's."""
     nowhere = error.errno == errno.ENOENT and str(path).startswith(_SYSTEM)
@@ -122,6 +130,20 @@ def check_new(folder: Path) -> None:
     """Raise UserError unless `folder` is empty or does not exist yet: what is there is never overwritten."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise problem(folder, "a new or empty folder", "something there", "choose another --out or remove it")
+
+
+@contextmanager
+def filling(folder: Path) -> Iterator[None]:
+    """Fill a new folder; where that fails nothing half written stays there. Raises UserError unless it is new or empty.
+
+    For copies alone: what was recorded is kept, whatever happened.
+    """
+    check_new(folder)
+    try:
+        yield
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def write_bytes(path: Path, data: bytes) -> None:

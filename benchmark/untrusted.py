@@ -136,12 +136,17 @@ class Expected:
 
 
 def read_npz(
-    path: Path, what: str, arrays: Mapping[str, Expected] | None = None, fix: str = _AGAIN, optional: bool = False
+    path: Path,
+    what: str,
+    arrays: Mapping[str, Expected] | None = None,
+    fix: str = _AGAIN,
+    optional: bool = False,
+    most_bytes: int = MOST_ARRAY_BYTES,
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file by name: all of them, or `arrays`, with `optional` those of them that are there.
 
     `what` and `fix` are for the error. Raises UserError where the file is missing or damaged, or lacks one of the
-    arrays, where one has another type or shape, and where they have more than MOST_ARRAY_BYTES. Nothing is unpickled.
+    arrays, where one has another type or shape, and where they have more than `most_bytes`. Nothing is unpickled.
     """
     try:
         with zipfile.ZipFile(path) as file:
@@ -154,8 +159,8 @@ def read_npz(
                 if dtype.hasobject or dtype.kind not in expected.kinds or not _fits(shape, expected.shape):
                     raise problem(path, what, f"{name} of shape {shape} and type {dtype}"[:200], fix)
                 total += math.prod((*shape, dtype.itemsize))
-            if total > MOST_ARRAY_BYTES:
-                raise problem(path, f"{what}, {MOST_ARRAY_BYTES} bytes at most", f"{total}", fix)
+            if total > most_bytes:
+                raise problem(path, f"{what}, {most_bytes} bytes at most", f"{total}", fix)
             return {name: _array(file, name) for name in names}
     except FileNotFoundError:
         raise problem(path, what, "no such file", fix) from None

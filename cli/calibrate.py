@@ -8,7 +8,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import locked, remove_parts
+from spike4dgs.benchmark.files import locked, remove_parts, visible
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.benchmark.scene.calibration import Calibration, estimate
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -31,6 +31,9 @@ def calibrate(scene: Positional[Path], *, out: Path = Path("runs/calibration")) 
     with locked(out / ".lock", out, "a folder that no other calibration writes to", temporary=True):
         remove_parts(out)
         given = [opened.cameras[c] for c in opened.meta["streams"]]  # a training part keeps the others back
+        if others := [p.name for p in visible(out, "*.npz") if p.stem not in opened.meta["streams"]]:
+            fix = "choose another --out, or remove it"
+            raise problem(out, "a folder for this scene's maps", f"{others[0]} of another scene", fix)
         rows = [_calibrated(opened, camera, scene, out) for camera in given]
     columns = "camera", "spikes/tick, flat", "dark, median", "gain spread, %", "gain error, % RMS", "dark error, % RMS"
     show_table("", columns, rows, None)

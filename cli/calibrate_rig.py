@@ -12,7 +12,7 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import locked, remove_parts, write_json, write_text
+from spike4dgs.benchmark.files import check_writable, locked, remove_parts, write_json, write_text
 from spike4dgs.benchmark.reports.figure import new_figure, save_figure
 from spike4dgs.generators.recorder.rig_calibration.array_calibration import (
     ArrayCalibration,
@@ -59,6 +59,9 @@ def calibrate_rig(
     """
     if not clips:
         raise problem("calibrate-rig", "one or more clips", "none", "record the board with `spike4dgs record`")
+    if views < 1:
+        raise problem("--views", "1 or more", str(views), "correct it")
+    check_writable(out)
     recordings = [open_recording(path, allow_gaps) for path in clips]
     names, size = common_cameras(recordings)
     chosen = choose_views(recordings, views, window_ticks)

@@ -7,6 +7,7 @@ import difflib
 import functools
 import importlib
 import inspect
+import io
 import os
 import re
 import shutil
@@ -37,6 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     lost data; 130: interrupted; 141: the reader of the output closed it, as `| head` does.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a name that a pipe's code page lacks is escaped, and ends nothing
+            stream.reconfigure(errors="backslashreplace")
     try:
         code = _dispatch(arguments)
         sys.stdout.flush()

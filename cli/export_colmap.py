@@ -17,7 +17,7 @@ from tyro.conf import Positional
 
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import check_new
+from spike4dgs.benchmark.files import filling
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.scene.writer import write_colmap
@@ -56,10 +56,13 @@ def export_colmap(
     opened = open_scene(scene, allow_gaps, split)
     check_names("--images", [images], IMAGES)
     chosen = _ticks(ticks, every, opened.n_ticks)
-    check_new(out)
-    written = {camera: _write_images(out / "images", opened, camera, images, chosen) for camera in opened.train}
+    if not any(present(s.gaps, s.n_ticks)[chosen].any() for s in map(opened.stream, opened.train)):
+        fix = "choose other --ticks or another --every"
+        raise problem(scene, "a tick with data among those of the images", "none", fix)
     cameras = [opened.cameras[camera] for camera in opened.train]
-    write_colmap(out / "sparse" / "0", cameras, np.zeros((0, 3)), written)
+    with filling(out):
+        written = {camera.id: _write_images(out / "images", opened, camera.id, images, chosen) for camera in cameras}
+        write_colmap(out / "sparse" / "0", cameras, np.zeros((0, 3)), written)
     print(f"{out / 'images'}: {sum(map(len, written.values()))} {images} images of {len(cameras)} cameras")
     print(f"{out / 'sparse' / '0'}: COLMAP model of their poses, without points")
     if opened.test:

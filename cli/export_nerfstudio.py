@@ -25,7 +25,7 @@ from tyro.conf import Positional
 from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import check_new, write_json
+from spike4dgs.benchmark.files import filling, write_json
 from spike4dgs.benchmark.scene.cameras import Camera, distortion_px, to_nerfstudio
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
@@ -77,7 +77,6 @@ def export_nerfstudio(
         raise problem("--every", "2 ticks or more", str(every), "leave room for the validation images between")
     used = [opened.cameras[c] for c in (*opened.train, *opened.test)]
     angle = _angle_x(used, scene)
-    check_new(out)
     ticks = range(0, opened.n_ticks, every)
     between = range(every // 2, opened.n_ticks, _VAL_EVERY * every)
     truth = opened.ground_truth_rgb if colour else opened.ground_truth
@@ -93,18 +92,19 @@ def export_nerfstudio(
         name: [Target(camera, tick) for camera in opened.train for tick in times if seen[camera][tick]]
         for name, times in (("train", ticks), ("val", between))
     }
-    for target in parts["train"][:1]:
-        from_spikes(target)  # a maker that lacks something says so before anything is written
+    if not parts["train"]:
+        raise problem(scene, "a tick with data among those of the training images", "none", "choose another --every")
     tests = [target for target in opened.targets if f"images/{target.name}.exr" in opened.manifest.files]
-    frames = {"test": [_write(out, "test", opened, target, truth(target)) for target in tests]}
-    for name, targets in parts.items():
-        frames[name] = [_write(out, name, opened, target, from_spikes(target)) for target in targets]
-    for name, of_part in frames.items():  # after all images: what is cut off has no description
-        path = out / f"transforms_{name}.json"
-        print(f"{path}: {len(of_part)} images" if of_part else f"no {path.name}: the scene has no such images")
-        if of_part:  # the parser opens the first image
-            write_json(path, _d_nerf(angle, used[0], of_part))
-    write_json(out / "transforms.json", _with_intrinsics(frames))
+    with filling(out):
+        frames = {"test": [_write(out, "test", opened, target, truth(target)) for target in tests]}
+        for name, targets in parts.items():
+            frames[name] = [_write(out, name, opened, target, from_spikes(target)) for target in targets]
+        for name, of_part in frames.items():  # after all images: what is cut off has no description
+            path = out / f"transforms_{name}.json"
+            print(f"{path}: {len(of_part)} images" if of_part else f"no {path.name}: the scene has no such images")
+            if of_part:  # the parser opens the first image
+                write_json(path, _d_nerf(angle, used[0], of_part))
+        write_json(out / "transforms.json", _with_intrinsics(frames))
     print(_LOSSES)
     return 0
 

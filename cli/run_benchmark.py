@@ -14,6 +14,7 @@ from pathlib import Path
 from tyro.conf import OmitArgPrefixes, Positional
 
 from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.files import check_writable
 from spike4dgs.benchmark.method import (
     DEFAULT_BUDGET,
     Method,
@@ -42,6 +43,7 @@ from spike4dgs.benchmark.runs.run import Settings, split_folder
 from spike4dgs.benchmark.scene.scene import open_scene, open_scenes
 from spike4dgs.cli.options import From, SetValues
 from spike4dgs.cli.submit import submit_all
+from spike4dgs.leaderboard.entry import check_folder
 from spike4dgs.leaderboard.reading import typical_fit_seconds
 from spike4dgs.leaderboard.tracks import is_equivalent, release_line, track_scenes
 
@@ -154,6 +156,9 @@ def run_benchmark(
             option = "--from" if name == "source" else f"--{name}"
             expected = f"{' or '.join(f'--{other}' for other in needed)} beside it"
             raise problem(option, expected, "none", f"leave {option} out")
+    if entries.leaderboard is not None:  # before the fits
+        check_folder(entries.leaderboard)
+        check_writable(entries.leaderboard)
     paper = None if choice.table is None else published(choice.table, choice.poses)
     if paper:
         if scenes:
@@ -195,8 +200,8 @@ def _run(
     if fits.scheduler is None or device == "auto":
         device = choose_device_for(methods, device)
     budget, console, runs = make_budget(fits.budget), make_console(), list[SplitRun]()
-    for split in splits:
-        opened = open_scenes(scenes, allow_gaps, split)
+    every = [open_scenes(scenes, allow_gaps, split) for split in splits]  # what lacks a split says so before the fits
+    for split, opened in zip(splits, every, strict=True):
         if not runs and (line := release_line(opened)):
             console.print(line, highlight=False, markup=False)
         out = split_folder(fits.out, split, opened)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.files import check_file
 from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
 from spike4dgs.benchmark.runs.display import cell_summary, metrics_summary
 from spike4dgs.benchmark.runs.record import write_record
@@ -34,6 +35,8 @@ def score(
         split: Split that the predictions are for; each scene's default if left out.
         allow_gaps: Accept recordings with gaps.
     """
+    if out is not None:
+        check_file(out)
     record = score_predictions(predictions, open_scenes(scenes, allow_gaps, split), select_metrics(metrics))
     name = record["method"]["name"] + (f", split {split}," if split else "")
     for scene, cell in record["scenes"].items():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.method import DEFAULT_BUDGET, choose_device_for, get_method, make_budget
 from spike4dgs.benchmark.metrics.measure import AUTO
 from spike4dgs.benchmark.reports.console import make_console, print_results
@@ -128,6 +128,8 @@ def predict(
         seed: Seed of all random numbers.
         device: auto, cpu or cuda.
     """
+    if not methods:
+        raise problem("--methods", "names of methods", "none", "see `spike4dgs methods`")
     chosen = [get_method(name) for name in methods]
     settings = Settings(out, seed, choose_device_for(chosen, device), make_budget(budget), apart=Apart())
     failed = predict_all(open_scenes(scenes), chosen, settings)
@@ -202,6 +204,9 @@ def check(
         predictions: Folder of the scored predictions, METHOD/ID/, to score them again.
         seasons: Folder of the public files.
     """
+    for option, folder in (("--scenes", scenes), ("--predictions", predictions)):
+        if folder is not None and not folder.is_dir():
+            raise problem(option, "a folder", f"{folder}, which is none", "correct the path")
     wrong = 0
     for one in checks(read_season(seasons, number), seasons, scenes, predictions):
         try:

@@ -9,7 +9,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import read_json, write_text
+from spike4dgs.benchmark.files import check_file, read_json, write_text
 from spike4dgs.generators.make_dataset import SceneSettings
 from spike4dgs.generators.profiles import RATE_HZ, Job
 from spike4dgs.generators.render_tasks import cameras_of, held_out_view, plan_of, world_of
@@ -52,6 +52,7 @@ def worlds(
         reports: Folder of scenes made with this profile, for the last column (WORLD-VARIANT-PROFILE.report.json).
         out: Markdown file.
     """
+    check_file(out)
     jobs = [SceneSettings(profile, seed, variant).job(name) for name in names or WORLDS]
     if reports is not None and not reports.is_dir():
         raise problem("--reports", "a folder with reports of scenes", str(reports), "correct the path")

@@ -32,7 +32,7 @@ from spike4dgs.generators.scene_maker import Maker
 from spike4dgs.generators.shared_rendering import SharingMaker, rendering_of
 
 T = TypeVar("T")
-_MOST_SECONDS = 60  # a length of 0.02 renders for minutes
+_MOST_SECONDS = 10  # a length of 0.02 renders for minutes; of longer clips, manifest.json would be too large to read
 _LINE_EVERY_S = 20.0  # between progress lines where the output is no terminal
 
 
@@ -79,8 +79,7 @@ class SceneSettings:
         if self.profile not in PROFILES:
             raise problem("--profile", f"one of {', '.join(PROFILES)}", repr(self.profile), "correct the name")
         if self.seed < 0 or self.variant < 0:
-            found = f"{self.seed}, {self.variant}"
-            raise problem("--seed and --variant", "numbers from 0 up", found, "correct them")
+            raise problem("--seed and --variant", "numbers from 0 up", f"{self.seed}, {self.variant}", "correct them")
         profile = (PROFILES if self.rendering == "paths" else SPLIT_PROFILES)[self.profile]
         length = profile.seconds if self.seconds is None else self.seconds
         ticks = length * RATE_HZ if length <= _MOST_SECONDS else -1.0
@@ -88,6 +87,9 @@ class SceneSettings:
             expected, fix = f"whole milliseconds, from 0.002 to {_MOST_SECONDS:g}", "give seconds such as 0.02"
             raise problem("--seconds", expected, str(self.seconds), fix)
         physics = self.physics.physics()
+        gaps = len(profile.views) * ticks * physics.lost_ticks * (1 - physics.lost_ticks)
+        if gaps > 100_000:  # likewise of scene.json
+            raise problem("--lost-ticks", "at most 100000 gaps", f"about {gaps:.0f}", "make a shorter clip")
         if physics.moves_array and self.rendering == "split":
             expected, fix = "an array that stands still", "make it with --rendering paths"
             raise problem("--rendering split", expected, "--array-motion or --array-rotation", fix)
@@ -294,6 +296,5 @@ def _lines(console: Console, title: str, steps: Iterable[T], total: int) -> Iter
         now = time.perf_counter()
         if done == total or now - shown > _LINE_EVERY_S:
             shown = now
-            left = "" if done == total else left_text(pace.left())
-            facts = f"{title} {done}/{total}", seconds_text(now - start), left
+            facts = f"{title} {done}/{total}", seconds_text(now - start), left_text(pace.left()) if done < total else ""
             console.print(", ".join(filter(None, facts)), markup=False)

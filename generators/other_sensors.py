@@ -48,17 +48,25 @@ def noisy_frame(radiance: Float32, noise: FrameNoise, rng: np.random.Generator) 
 
 
 def exposures(
-    keys: Sequence[Float32], key_ticks: Sequence[int], n_ticks: int, rate_hz: int
+    keys: Sequence[Float32], key_ticks: Sequence[int], n_ticks: int, rate_hz: int, means: bool = False
 ) -> Iterator[tuple[int, Float32]]:
     """Yield (tick at which the exposure begins, mean radiance [H, W]) of each frame whose exposure fits into the clip.
 
-    `keys` are read in ascending order, each exposure's keys once. A clip shorter than one exposure has no frame.
+    `keys` are read in ascending order, each exposure's keys once; with `means` there is one for each tick, the mean
+    over it. A clip shorter than one exposure has no frame.
     """
     length = round(EXPOSURE_S * rate_hz)
     frame = 0
     while (start := round(frame * rate_hz / FPS)) + length <= n_ticks:
-        yield start, _mean(keys, key_ticks, start, start + length)
+        yield start, (_mean_of if means else _mean)(keys, key_ticks, start, start + length)
         frame += 1
+
+
+def _mean_of(means: Sequence[Float32], ticks: Sequence[int], start: int, end: int) -> Float32:
+    total = np.zeros(np.shape(means[start]))
+    for tick in ticks[start:end]:
+        total += means[tick]
+    return (total / (end - start)).astype(np.float32)
 
 
 def _mean(keys: Sequence[Float32], key_ticks: Sequence[int], start: int, end: int) -> Float32:

@@ -217,6 +217,8 @@ class PhysicsOptions:
         if self.lens:
             changed["lens"] = make_distortion(self.lens)
         found = replace(CAMERAS[self.camera], **changed)
+        if not found.flicker and (self.flicker_hz is not None or self.flicker_duty is not None):
+            raise problem("--flicker-hz and --flicker-duty", "the depth, --flicker", "none", "give it, or neither")
         if found.lens_spread and not found.lens:
             if self.lens_spread:
                 raise problem("--lens-spread", "the mean lens, --lens", "none", "give both, or leave both out")

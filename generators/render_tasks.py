@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.generators.physics import from_settings, true_cameras
@@ -37,24 +38,27 @@ Watch = Callable[[str, Iterable[Any], int], Iterator[Any]]
 
 
 def recorded_job(source: Mapping[str, Any]) -> Job | None:
-    """Return the job whose `settings` are in the `source` of a scene.json.
+    """Return the job whose `settings` are in the `source` of a scene.json; None where no world here made the scene.
 
-    None for a scene that no world of this installation made.
+    Raises UserError where settings lack or are of another kind.
     """
-    if source["kind"] != "mitsuba" or source["world"] not in WORLDS:
+    if source["kind"] != "mitsuba" or not isinstance(world := source.get("world"), str) or world not in WORLDS:
         return None
-    same = ("gain_map", "dark_map", "shot_noise", "sub_ticks", "whole_frames", "noise")
-    return Job(
-        source["world"],
-        source["variant"],
-        int(source["seed"]),
-        source["profile"],
-        Profile.from_settings(source["sampling"]),
-        source["seconds"],
-        adaptive=source.get("adaptive_keys", True),
-        physics=from_settings(source.get("physics", {})),
-        **{name: source[name] for name in same if name in source},
-    )
+    same = {"gain_map", "dark_map", "shot_noise", "sub_ticks", "whole_frames", "noise"} & source.keys()
+    try:
+        return Job(
+            world,
+            source["variant"],
+            int(source["seed"]),
+            source["profile"],
+            Profile.from_settings(source["sampling"]),
+            source["seconds"],
+            adaptive=source.get("adaptive_keys", True),
+            physics=from_settings(source.get("physics", {})),
+            **{name: source[name] for name in same},
+        )
+    except (KeyError, TypeError, ValueError) as e:
+        raise problem("scene.json, source", f"the settings of {world}", repr(e)[:200], "make it again") from None
 
 
 @lru_cache(maxsize=1)
@@ -263,8 +267,7 @@ def render_static(job: Job, folder: Path, run: Run = here, watch: Watch = unseen
 def _views(job: Job, truth: bool, other: StaticViews | None, folder: Path, run: Run, watch: Watch) -> StaticViews:
     """Return the static views of streams or of ground truth; paths are whole: with the background of `other`."""
     cameras, p = cameras_of(job), job.profile
-    shape = len(cameras) * len(world_of(job).layers), p.height, p.width
-    n = int(np.prod(shape))
+    n = int(np.prod(shape := (len(cameras) * len(world_of(job).layers), p.height, p.width)))
     bounds = np.linspace(0, n, min(max(n // _PIXELS, 2), _MOST_PARTS) + 1).astype(int).tolist()
     ranges = list(zip(bounds[:-1], bounds[1:], strict=True))
 

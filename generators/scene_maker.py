@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from spike4dgs import benchmark
 from spike4dgs.benchmark.environment import installed_version
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import locked, read_json, remove_parts, sha256_json, write_json, writing
@@ -279,13 +280,15 @@ class Maker:
 
 
 def work_key(settings: dict[str, Any], versions: dict[str, str]) -> str:
-    """Return the key of unfinished work, which other code of this room, also of one version, does not go on with."""
-    return sha256_json([settings, versions, _sources()])
+    """Return the key of unfinished work, which no other code of this room, `benchmark` or the world takes up."""
+    return sha256_json([settings, versions, _sources(settings["world"])])
 
 
 @cache
-def _sources() -> str:
-    return sources_sha256([sys.modules[__name__.rpartition(".")[0]]])
+def _sources(world: str) -> str:
+    room, package = __name__.rpartition(".")[0], WORLDS[world].build.__module__.partition(".")[0]
+    others = {package} - {room.partition(".")[0]}
+    return sources_sha256([sys.modules[name] for name in (room, benchmark.__name__, *others)])
 
 
 @contextmanager

@@ -54,17 +54,18 @@ def write_camera(scene: Path, job: Job, camera: Camera, store: KeyStore, view: i
     size, entropy = (camera.height, camera.width), [job.seed, job.variant, *f"{job.world} {camera.id}".encode()]
     write_maps(scene / f"truth/{camera.id}.npz", {"gain": sensor.gain, "dark": sensor.dark})
     calibration.write_calibration(scene / "calibration", camera, sensor, entropy)
-    instants, clip = _lit(job, store, view, plan)
+    # In flicker the light at the start of each tick tells too little of a frame: some lamps flicker as fast as ticks.
+    exposed = _lit(job, store, view, plan)[1 if job.flicker else 0]
     noisy, light, rng = (
         job.physics.noisy_others,
         np.float32(job.physics.light),
         np.random.default_rng([*entropy, *b"others"]),
     )
-    for tick, image in exposures(instants.keys, instants.ticks, job.n_ticks, RATE_HZ):
+    for tick, image in exposures(exposed.keys, exposed.ticks, job.n_ticks, RATE_HZ, exposed.means):
         shown = noisy_frame(image * light, FrameNoise(), rng) / light if noisy else image
         write_png(scene / f"conventional/{Target(camera.id, tick).name}.png", encode_srgb(shown))
-    noise, again = EventNoise() if noisy else None, _lit(job, store, view, plan)[0]
-    found = events(again.keys, again.ticks, job.n_ticks, RATE_HZ, noise=noise, rng=rng)
+    noise, (instants, clip) = EventNoise() if noisy else None, _lit(job, store, view, plan)
+    found = events(instants.keys, instants.ticks, job.n_ticks, RATE_HZ, noise=noise, rng=rng)
     write_events(scene / f"events/{camera.id}.npz", found)
     charge, there, start = random_charge(*size, entropy), present(gaps_of(job, camera), job.n_ticks), 0
     with SpikeWriter(scene / stream_name(camera.id), camera.width, camera.height) as writer:

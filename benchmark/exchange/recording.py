@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import check_new
+from spike4dgs.benchmark.files import filling
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.folder import write_stream_folder
@@ -69,20 +69,25 @@ def write_recording(
         if len(shapes) > 1:
             found = " and ".join(f"{w}x{h}x{n}" for w, h, n in shapes)
             raise problem("streams", "one size and length for one scene", found, "cut them to one length")
-    check_new(out)
-    streams = {}
+    with filling(out):
+        streams = dict(_copies(out, sources, cameras, recording))
+        if cameras is None:
+            write_stream_folder(out, streams, {"source": {"kind": kind}})
+        else:
+            _write_scene(out, streams, cameras, recording, kind)
+    return streams
+
+
+def _copies(
+    out: Path, sources: Mapping[str, Source], cameras: tuple[Camera, ...] | None, recording: Recording
+) -> Iterator[tuple[str, SpikeStream]]:
     for camera, source in sources.items():
         target = out / (f"{camera}.dat" if cameras is None else stream_name(camera))
         with SpikeWriter(target, source.width, source.height) as writer:
             for packed in source.parts:
                 writer.write(packed)
         rate_hz, bottom_up = recording.rate_hz, not recording.rows_top_down
-        streams[camera] = open_stream(target, source.width, source.height, rate_hz, rows_bottom_up=bottom_up)
-    if cameras is None:
-        write_stream_folder(out, streams, {"source": {"kind": kind}})
-    else:
-        _write_scene(out, streams, cameras, recording, kind)
-    return streams
+        yield camera, open_stream(target, source.width, source.height, rate_hz, rows_bottom_up=bottom_up)
 
 
 def _write_scene(

@@ -23,7 +23,7 @@ from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.foreign_camera import FoundCamera, check_same
 from spike4dgs.benchmark.exchange.recording import Recording, Source, write_recording
-from spike4dgs.benchmark.files import atomic_path, check_new, read_json, write_text
+from spike4dgs.benchmark.files import atomic_path, filling, read_json, write_text
 from spike4dgs.benchmark.scene.cameras import Camera, from_nerfstudio
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -63,14 +63,14 @@ def import_spikecv(
 
 def export_spikecv(scene: Scene, out: Path) -> None:
     """Write the streams of a scene as SpikeCV folders OUT/CAMERA, rows bottom-up (SpikeCV's default)."""
-    check_new(out)
-    for camera in scene.meta["streams"]:
-        stream = scene.stream(camera)
-        with atomic_path(out / camera / f"{camera}.dat") as part, open(part, "wb") as file:
-            for start in range(0, stream.n_ticks, _TICKS):
-                spikes = stream.window(start, min(start + _TICKS, stream.n_ticks))
-                file.write(np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").data)
-        write_text(out / camera / CONFIG, _config(camera, stream))
+    with filling(out):
+        for camera in scene.meta["streams"]:
+            stream = scene.stream(camera)
+            with atomic_path(out / camera / f"{camera}.dat") as part, open(part, "wb") as file:
+                for start in range(0, stream.n_ticks, _TICKS):
+                    spikes = stream.window(start, min(start + _TICKS, stream.n_ticks))
+                    file.write(np.packbits(spikes[:, ::-1].reshape(-1), bitorder="little").data)
+            write_text(out / camera / CONFIG, _config(camera, stream))
 
 
 def _config(camera: str, stream: SpikeStream) -> str:

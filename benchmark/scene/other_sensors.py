@@ -28,6 +28,7 @@ from spike4dgs.benchmark.untrusted import Expected, read_npz
 
 T = TypeVar("T")
 _DIGITS = 15  # of a tick
+_MOST_EVENT_BYTES = 1 << 31  # of a camera: 165 million; at 400x250, an LED of 100 Hz gives up to 66 million in 100 ms
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,12 +193,19 @@ def find_events(meta: Mapping[str, Any], files: Manifest, cameras: Sequence[str]
 
 
 def write_events(path: Path, found: Events) -> None:
-    """Write events as `.npz` with the arrays t, x, y, p. Equal events give equal bytes."""
+    """Write events as `.npz` with the arrays t, x, y, p. Equal events give equal bytes.
+
+    Raises UserError where they are more than `read_events` takes.
+    """
+    if (total := sum(column.nbytes for column in found)) > _MOST_EVENT_BYTES:
+        expected = f"events of {_MOST_EVENT_BYTES} bytes at most"
+        raise problem(path, expected, f"{total}", "make a shorter clip, or calm the lamp")
     with atomic_path(path) as part:
         np.savez_compressed(part, allow_pickle=False, **found._asdict())
 
 
 def read_events(path: Path) -> Events:
     """Read events. Raises UserError where the file is missing or damaged."""
-    found = read_npz(path, "events (t, x, y, p)", dict.fromkeys(Events._fields, Expected("iu", (None,))), _AGAIN)
+    columns = dict.fromkeys(Events._fields, Expected("iu", (None,)))
+    found = read_npz(path, "events (t, x, y, p)", columns, _AGAIN, most_bytes=_MOST_EVENT_BYTES)
     return Events(**found)

@@ -7,7 +7,7 @@ lenses, textures, light and calibration; its spikes, its rate and its steps of t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from scipy.ndimage import binary_dilation, binary_opening
 
 from spike4dgs.benchmark.arrays import Float32, Mask, UInt8
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import check_new
+from spike4dgs.benchmark.files import filling
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import decode_srgb, gray, write_exr, write_mask
 from spike4dgs.benchmark.scene.scene import Target
@@ -96,21 +96,15 @@ def write_held_frames(
     """
     holding.check(footage)
     check_ids([out.resolve().name], "scene", "--out", "choose another name")
-    check_new(out)
     first = footage[holding.held_out]
     chosen, hold = holding.chosen(first.frames), holding.hold_ticks
     small = tuple(_shrunk(c, holding.width or c.width) for c in cameras)
-    for camera in small:
-        frames = [_light(image, camera, holding.linear) for image in read_frames(footage[camera.id], chosen)]
-        if camera.id == holding.held_out:
-            _write_truth(out, camera.id, frames, hold)
-        grays = [image if image.ndim == 2 else gray(image) for image in frames]
-        _write_streams(out, camera, grays, holding)
     ids = tuple(c.id for c in small)
     source = {"kind": "frames", **asdict(holding), "instants": len(chosen), "frame_size": [first.width, first.height]}
-    finish_scene(
-        out,
-        SceneDescription(
+    with filling(out):
+        for camera in small:
+            _write_camera(out, camera, footage[camera.id], chosen, holding)
+        description = SceneDescription(
             id=out.resolve().name,
             title=f"Footage {out.resolve().name}, each of {len(chosen)} instants held still",
             licence=holding.licence,
@@ -124,9 +118,18 @@ def write_held_frames(
             sensor=noisy_facts(),
             source=source,
             extras={"calibration": calibration_facts()},
-        ),
-    )
+        )
+        finish_scene(out, description)
     return source
+
+
+def _write_camera(out: Path, camera: Camera, footage: Footage, chosen: Sequence[int], holding: Holding) -> None:
+    """Write the spikes of a camera, and the truth of the held-out one. Others' colours are dropped as they are read."""
+    shown: Iterable[Float32] = (_light(image, camera, holding.linear) for image in read_frames(footage, chosen))
+    if camera.id == holding.held_out:
+        shown = list(shown)
+        _write_truth(out, camera.id, shown, holding.hold_ticks)
+    _write_streams(out, camera, [image if image.ndim == 2 else gray(image) for image in shown], holding)
 
 
 def _middle(instant: int, hold: int) -> int:

@@ -195,6 +195,8 @@ def _theil_sen(arrival: NDArray[np.float64]) -> _Line:
     residual = float(np.median(away))
     # Median absolute deviation -> standard deviation for normal scatter; medians use 64 % of it (hence pi / 2).
     error = 1.4826 * residual * math.sqrt(math.pi / 2) / (math.sqrt(len(x)) * float(np.std(x)))
+    if len(x) < 4:  # the median slope of three is that of two, through which a line has no scatter
+        error = math.nan
     return _Line(slope, error, height + float(base), residual, float(away.max()), len(arrival))
 
 

@@ -232,13 +232,13 @@ class Visibility:
         # a little short of the surface, so that it does not shadow itself
         points = sight.origins[met] + sight.ways[met] * (sight.reach[met, None] * 0.9995)
         found = []
-        for source in self.world.shadow_sources:
+        for source in self.world.shadow_sources if len(met) else ():  # Mitsuba casts no empty list of rays
             ways = source[:3] - source[3] * points
             length = np.linalg.norm(ways, axis=1)
             ways /= length[:, None]
             reach = length if source[3] else np.full(len(points), np.inf)
             free = self._tracer.cast_static(self._tracer.prepare(points, ways))[0] >= 0.999 * reach
-            if not free.any():  # no light falls on what is seen, and Mitsuba casts no empty list of rays
+            if not free.any():  # no light falls on what is seen
                 continue
             rays = self._tracer.prepare(points[free], ways[free])
             at = met[free]

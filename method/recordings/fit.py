@@ -30,6 +30,7 @@ from spike4dgs.benchmark.runs.cell import timed_fit
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.predictions import MethodInfo, check_place
 from spike4dgs.benchmark.runs.provenance import Provenance, Savable
+from spike4dgs.benchmark.spikes.folder import NAME as STREAMS
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.images.base import ImageMaker
 from spike4dgs.method.models.saved_model import SavedModel, load_model
@@ -63,6 +64,9 @@ def fit_recording(
     clip shows that they are wrong) or "given".
     """
     console, times, seed = make_console(), dict[str, float](), request.seed
+    for name in ("scene.json", STREAMS):  # a scene's sheet would be replaced
+        if (out / name).is_file():
+            raise problem(out, "a folder for the results of a fit", f"a recording ({name})", "choose another --out")
     with locked(out / ".lock", out, "a folder that no other fit uses"):
         check_place(out / PREDICTIONS)  # a benchmark's are of all methods and scenes
         remove_parts(out)
@@ -97,7 +101,7 @@ def fit_recording(
             judged=judged,
             slow_motion=slow_motion,
             seconds=times,
-            model_mb=(out / MODEL).stat().st_size / 1e6,
+            model_mb=(out / MODEL).stat().st_size / 1e6 if (out / MODEL).is_file() else None,
             environment=environment(request.device),
             command=command_line(),
             video=VIDEO,
@@ -107,7 +111,8 @@ def fit_recording(
     _say(console, f"fit: {times['fit']:.1f} s; residual of the training views {residual}")
     if judged:
         _say(console, f"held-out {', '.join(recording.held_out)} by their own spikes: {_scores(judged)}")
-    _say(console, f"model, sheet, video and report: {out}/{{{MODEL},{SHEET},{VIDEO},{REPORT}}}")
+    written = [name for name in (MODEL, SHEET, VIDEO, REPORT) if (out / name).is_file()]
+    _say(console, f"results: {out}/{{{','.join(written)}}}")
 
 
 def _scores(judged: HeldOutScores) -> str:
@@ -130,7 +135,7 @@ def _fitted(
 ) -> SavedModel:
     """Return the fitted model, which OUT then holds: that of an earlier run, or a new one.
 
-    Raises UserError where OUT holds a model of another fit, and for a method whose models cannot be saved.
+    Raises UserError where OUT holds a model of another fit. A method's models that cannot be saved are of one run.
     """
     path, about = out / MODEL, _provenance(method, recording, request, changed)
     if path.exists():
@@ -148,12 +153,13 @@ def _fitted(
     with RunDisplay(console, 1) as display, display.cell(f"{about.name} on {about.scene}") as shown:
         watched = replace(request, progress=shown.progress)
         model, fit_seconds = timed_fit(method, recording.training, watched, work, shown.note)
-    if not isinstance(model, Savable):
-        raise problem(f"method {method.name}", "a method whose models can be saved", "none", "choose another --method")
     cameras = getattr(model, "cameras", ()) or about.cameras  # as the fit left them, where the model knows
     about = replace(about, cameras=cameras, fit_seconds=fit_seconds, created=utc_now())
-    model.save(path, about)
-    shutil.rmtree(work)
+    if isinstance(model, Savable):
+        model.save(path, about)
+    else:
+        _say(console, f"models of {method.name} cannot be saved: there is no {MODEL}, and each run fits anew")
+    shutil.rmtree(work, ignore_errors=True)
     with suppress(OSError):  # it holds others' checkpoints
         work.parent.rmdir()
     return SavedModel(model, about)

@@ -37,7 +37,7 @@ class Report:
     judged: HeldOutScores | None  # the held-out cameras by their own spikes
     slow_motion: float  # how many times slower than the world the video is
     seconds: Mapping[str, float]  # by step
-    model_mb: float
+    model_mb: float | None  # None where it cannot be saved
     environment: Mapping[str, Any]
     command: str
     video: str  # file name beside the page
@@ -108,7 +108,7 @@ def _summary(report: Report) -> list[tuple[str, str]]:
         ("poses", report.poses),
         ("mean residual", f"{mean} dB (not a score)"),
         ("times", steps),
-        ("model", f"{report.model_mb:.2f} MB"),
+        ("model", "cannot be saved" if report.model_mb is None else f"{report.model_mb:.2f} MB"),
     ]
 
 

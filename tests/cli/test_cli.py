@@ -1,5 +1,6 @@
 import functools
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -157,6 +158,20 @@ def test_score_prints_a_line_for_each_scene_and_writes_a_record(
     assert line.startswith(f"counts on pattern-0: psnr {expected['mean']['psnr']:.2f}, ssim ") and "fit " in line
     assert written.endswith("r.json")
     assert read_record(tmp_path / "r.json")["scenes"] == expected["scenes"]
+
+
+def test_a_folder_in_place_of_a_file_is_said_before_the_work(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in (["score", str(tmp_path / "none"), str(small_scene)], ["worlds", "car"]):
+        assert main([*arguments, "--out", str(tmp_path)]) == 2
+        assert capsys.readouterr().err.startswith("error: --out: expected the name of a file, found the folder")
+
+
+def test_a_name_that_the_outputs_encoding_lacks_is_escaped(small_scene: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(small_scene, tmp_path / "\u6570\u636e")
+    done = python("-m", "spike4dgs.cli", "verify", str(folder), PYTHONIOENCODING="cp1252")
+    assert done.returncode == 0 and "\\u6570\\u636e: " in done.stdout and not done.stderr
 
 
 def test_score_refuses_other_images(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

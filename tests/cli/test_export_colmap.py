@@ -77,11 +77,14 @@ def test_images_at_missing_ticks_are_left_out_and_those_beside_no_darker(small_s
         ({"images": "video"}, "--images: expected one of tfp, tfi,"),
         ({"every": 0}, "--every: expected 1 tick or more, found 0"),
         ({"every": 5, "ticks": (1,)}, "--ticks and --every: expected one of them, found both"),
+        ({"ticks": (40,), "allow_gaps": True}, "a tick with data among those of the images, found none"),
         ({"ticks": (80,)}, "--ticks: expected ticks of the clip, 0 to 79, found 80"),
         ({"split": "left"}, "expected a split among center, found 'left'"),
     ],
 )
 def test_bad_arguments_are_refused(small_scene: Path, tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
+    for camera in open_scene(small_scene).train if arguments.get("allow_gaps") else ():
+        lose_ticks(small_scene, camera, 35, 10)
     with pytest.raises(UserError) as e:
         export_colmap(small_scene, tmp_path / "out", **arguments)
     assert message in str(e.value) and not (tmp_path / "out").exists()

@@ -130,6 +130,14 @@ def test_a_maker_that_lacks_its_weights_writes_nothing(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_recording_without_a_training_image_is_refused(small_scene: Path, tmp_path: Path) -> None:
+    for camera in open_scene(small_scene).train:
+        lose_ticks(small_scene, camera, 0, 10)
+    with pytest.raises(UserError, match="a tick with data among those of the training images, found none"):
+        export_nerfstudio(small_scene, tmp_path / "out", every=80, allow_gaps=True)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_training_part_has_no_test_images(small_scene: Path, tmp_path: Path) -> None:
     part = write_training_part(open_scene(small_scene), tmp_path / "part")
     assert export_nerfstudio(part.root, tmp_path / "out") == 0

@@ -22,6 +22,7 @@ from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import UserError, open_scene, plugins
 from spike4dgs.benchmark.reports import benchmark
+from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.cli import main
 from spike4dgs.cli import run_benchmark as command
@@ -250,12 +251,25 @@ def test_another_record_in_a_shared_leaderboard_needs_replace(
         ({"device": "cuda:99"}, "--device: expected a CUDA device of this machine, found 'cuda:99'"),
         ({"scenes": ()}, "scenes: expected at least one scene folder"),
         ({"scenes": (Path("nowhere"),)}, "nowhere: expected a scene folder, found no such folder"),
+        ({"leaderboard": Path("tests")}, "--leaderboard: expected a leaderboard or a new folder at tests"),
     ],
 )
 def test_bad_arguments_are_refused(small_scene: Path, tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError) as e:
         run_benchmark(**{"scenes": (small_scene,), "out": tmp_path / "out", **arguments})
     assert message in str(e.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_split_that_a_scene_lacks_is_said_before_the_first_fit(small_scene: Path, tmp_path: Path) -> None:
+    """Table 5 compares views-3, views-4 and so on; this scene has but the first."""
+    data = tmp_path / "data"
+    for world in published(5).worlds:
+        folder = shutil.copytree(small_scene, data / f"{world}-0-tiny")
+        edit_json(folder / "scene.json", lambda meta: meta["splits"].update({"views-3": meta["splits"]["center"]}))
+        write_manifest(folder)
+    with pytest.raises(UserError, match="expected a split among center, views-3, found 'views-4'"):
+        run_benchmark(table=5, data=data, profile="tiny", methods=("nearest-view",), out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

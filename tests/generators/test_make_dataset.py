@@ -212,6 +212,20 @@ def test_other_settings_do_not_reuse_unfinished_work(fake, tmp_path):
     assert seven["spikes/cam_00.dat"] != clean["spikes/cam_00.dat"]
 
 
+def test_code_of_unfinished_work_is_this_room_the_benchmark_and_another_packages_world(monkeypatch):
+    def hashed(world):
+        names = []
+        monkeypatch.setattr(scene_maker, "sources_sha256", lambda found: names.extend(m.__name__ for m in found))
+        scene_maker._sources.__wrapped__(world)
+        return names
+
+    ours = ["spike4dgs.generators", "spike4dgs.benchmark"]
+    assert hashed("car") == ours
+    theirs = replace(scene_maker.WORLDS["car"], build=files_in)
+    monkeypatch.setattr(scene_maker, "WORLDS", {"theirs": theirs})
+    assert hashed("theirs") == [*ours, files_in.__module__]
+
+
 def test_unfinished_work_of_other_code_is_made_anew(fake, monkeypatch, tmp_path):
     rendered = count_keys(monkeypatch)
 
@@ -229,7 +243,7 @@ def test_unfinished_work_of_other_code_is_made_anew(fake, monkeypatch, tmp_path)
 
     (keys, shared), again = keys_and_shared(), keys_and_shared()
     assert keys and again == (0, shared)
-    monkeypatch.setattr(scene_maker, "_sources", lambda: "of a world that was edited")
+    monkeypatch.setattr(scene_maker, "_sources", lambda world: "of a world that was edited")
     anew, other = keys_and_shared()
     assert anew == keys and other != shared
 
@@ -339,6 +353,9 @@ def test_a_foreign_folder_is_never_touched(fake, tmp_path):
         ("car", {"physics": PhysicsOptions(lens=(-9.0,))}, "whose model holds up to the image's corners"),
         ("car", {"options": "lens=-0.1 lens-spread=1"}, "--lens-spread: expected a share from 0 to below 1"),
         ("car", {"physics": PhysicsOptions(lens_spread=0.2)}, "--lens-spread: expected the mean lens"),
+        ("car", {"physics": PhysicsOptions(flicker_hz=120.0)}, "--flicker-hz and --flicker-duty: expected the depth"),
+        ("car", {"seconds": 11.0}, "--seconds: expected whole milliseconds, from 0.002 to 10"),
+        ("car", {"options": "lost-ticks=0.5", "seconds": 6.0}, "--lost-ticks: expected at most 100000 gaps"),
     ],
 )
 def test_bad_arguments_are_one_line(world, options, words, tmp_path):

@@ -7,11 +7,41 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spike4dgs.generators import other_sensors
+from spike4dgs.benchmark.scene.images import decode_srgb, read_png
+from spike4dgs.cli.make_dataset import physics_of
+from spike4dgs.generators import other_sensors, streams
+from spike4dgs.generators.make_dataset import SceneSettings
 from spike4dgs.generators.other_sensors import THRESHOLD, EventNoise, events, exposures
+from spike4dgs.generators.render_tasks import cameras_of
+from spike4dgs.generators.rendering.image_motion import KeyPlan
+from spike4dgs.generators.rendering.keyframes import Clip
 from spike4dgs.generators.sensor.reference import tick_means
 
 RATE = 20_000
+
+
+class Gray:
+    """A store of keys that shows radiance 0.4 at every tick."""
+
+    def instants(self, view, plan):
+        return Clip([np.full((40, 64), 0.4, np.float32)] * len(plan.ticks), plan.ticks)
+
+    view = instants
+
+    def at(self, view, plan):
+        return lambda tick: np.full((40, 64), 0.4, np.float32)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_frame_has_the_mean_of_light_that_flickers_faster_than_ticks(seed, tmp_path):
+    """At 10 kHz, the light at the starts of ticks is high in every second one, or in none."""
+    job = physics_of("flicker=1 flicker-hz=10000 flicker-duty=0.3")
+    job = SceneSettings(profile="tiny", seconds=0.009, seed=seed, physics=job).job("car")
+    streams.write_camera(tmp_path, job, cameras_of(job)[0], Gray(), 0, KeyPlan(180, RATE, 0.5, (20,)))
+    (file,) = (tmp_path / "conventional").rglob("*.png")
+    frame = decode_srgb(read_png(file))
+    assert np.abs(frame - 0.4 * np.mean([job.flicker.mean(t) for t in range(167)])).max() < 0.005
+    assert frame.mean() == pytest.approx(0.4, rel=0.02)
 
 
 def smooth_keys(spacing, n_ticks, shape=(5, 7)):

@@ -82,6 +82,13 @@ def test_settings_are_read_back():
         assert recorded_job(json.loads(json.dumps(made.settings))) == made
 
 
+@pytest.mark.parametrize("change", [{"seed": None}, {"sampling": {}}, {"physics": {"glare": 1}}])
+def test_settings_that_are_no_worlds_are_one_error(change):
+    with pytest.raises(UserError, match="scene.json, source: expected the settings of car"):
+        recorded_job(json.loads(json.dumps(JOB.settings)) | change)
+    assert recorded_job({"kind": "mitsuba"}) is None and recorded_job({"kind": "mitsuba", "world": ["car"]}) is None
+
+
 def test_an_option_replaces_that_of_the_named_camera():
     realistic = CAMERAS["realistic"]
     assert PhysicsOptions("realistic").physics() == realistic
@@ -97,8 +104,8 @@ def test_an_option_replaces_that_of_the_named_camera():
         ({"psf_px": 2.0}, "--psf-px: expected px from 0 to 0.8"),
         ({"flicker": 1.5}, "--flicker: expected a depth"),
         ({"flicker": float("nan")}, "--flicker"),
-        ({"flicker_duty": 1.0}, "--flicker-duty"),
-        ({"flicker_hz": 0.0}, "--flicker-hz"),
+        ({"flicker": 0.1, "flicker_duty": 1.0}, "--flicker-duty: expected 0"),
+        ({"flicker": 0.1, "flicker_hz": 0.0}, "--flicker-hz: expected Hz from 1"),
         ({"pose_noise_deg": -1.0}, "--pose-noise-deg"),
         ({"dead_ticks": -1}, "--dead-ticks"),
         ({"dead_ticks": 11}, "--dead-ticks: expected ticks from 0 to 10"),

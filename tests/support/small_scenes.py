@@ -92,5 +92,5 @@ def add_gap(scene: Path, camera: str, first_tick: int, ticks: int) -> None:
     """State in a scene's files that ticks of a camera are missing."""
     meta = json.loads((scene / "scene.json").read_text())
     gap = {"camera": camera, "first_tick": first_tick, "ticks": ticks, "reason": "test"}
-    (scene / "scene.json").write_text(json.dumps({**meta, "gaps": [gap]}))
+    (scene / "scene.json").write_text(json.dumps({**meta, "gaps": [*meta["gaps"], gap]}))
     write_manifest(scene)

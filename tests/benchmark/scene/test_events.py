@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from small_scenes import HEIGHT, TICKS, WIDTH, write_small_scene
 
 from spike4dgs.benchmark import UserError, open_scene
+from spike4dgs.benchmark.scene import other_sensors
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.other_sensors import Events, EventStream, read_events, write_events
 from spike4dgs.generators.other_sensors import THRESHOLD, events
@@ -112,6 +113,17 @@ def test_a_scene_without_events_says_so(small_scene: Path) -> None:
     for found in (scene.events, scene.training.events):
         with pytest.raises(UserError, match="events of an event camera at cam_00, found none; use a scene that has"):
             found("cam_00")
+
+
+def test_more_events_than_can_be_read_are_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, there = tmp_path / "cam.npz", sum(column.nbytes for column in pair())
+    monkeypatch.setattr(other_sensors, "_MOST_EVENT_BYTES", there)
+    write_events(path, pair())
+    assert same(read_events(path), pair())
+    monkeypatch.setattr(other_sensors, "_MOST_EVENT_BYTES", there - 1)
+    for use in (lambda: read_events(path), lambda: write_events(path, pair())):
+        with pytest.raises(UserError, match=f"{there - 1} bytes at most, found {there}"):
+            use()
 
 
 def test_files_come_back_and_damage_is_named(tmp_path: Path) -> None:

@@ -71,6 +71,19 @@ def test_truth_and_spikes_are_the_light_of_the_frames(tmp_path: Path, linear: bo
             assert np.abs(counts - 200 * np.minimum(rate, 1)).max() < 1.5
 
 
+def test_a_damaged_frame_leaves_nothing_and_the_mended_footage_is_taken(tmp_path: Path) -> None:
+    footage = find_footage(write_footage(tmp_path / "footage"))
+    image = tmp_path / "footage/cam_02/2.png"
+    whole = image.read_bytes()
+    image.write_bytes(whole[:60])
+    with pytest.raises(UserError, match="cam_02/2.png: expected an image, found damaged data"):
+        write_held_frames(tmp_path / "scene", footage, CAMERAS, HOLDING)
+    assert not (tmp_path / "scene").exists()
+    image.write_bytes(whole)
+    write_held_frames(tmp_path / "scene", footage, CAMERAS, HOLDING)
+    assert open_scene(tmp_path / "scene").test == ("cam_01",)
+
+
 def test_colour_is_kept_in_the_truth_and_gray_is_what_the_sensors_see(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, colour=True)
     light = light_of(frame(1, 0, colour=True), linear=False)

@@ -107,6 +107,14 @@ def test_a_clip_too_short_to_tell_says_so_instead_of_a_number() -> None:
     assert not long.too_short and long.drift_text == f"{long.drift_ppm:+.0f} +- {long.drift_error_ppm:.0f}"
 
 
+def test_three_reads_have_no_scatter_that_tells() -> None:
+    """The median slope of three points is that of the outer two, through which a line passes without an error."""
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        camera = fit_arrival(clip_of({"a": arrivals(0, 0, rng.exponential(200.0, 3))}, 60), FPS).cameras[0]
+        assert camera.too_short and not camera.suspect and math.isnan(camera.drift_error_ppm)
+
+
 def test_a_rate_twice_the_stated_one_is_suspect_in_a_short_clip_too() -> None:
     late = np.random.default_rng(4).normal(0, 400, 100)
     camera = fit_arrival(clip_of({"a": arrivals(-5e5, 0, late)}, 2000), FPS).cameras[0]

@@ -11,6 +11,7 @@ from changes import edit_json, flip_bit
 from fake_renderer import render_fakes
 from made_season import NUMBER, Made
 
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.runs.record import dataset_means
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.cli.season import check, reveal
@@ -81,6 +82,12 @@ def test_season_0_is_revealed_and_right(said: Any) -> None:
     assert check(0, seasons=seasons) == 0
     out = said()
     assert "ok: the seeds of 2 scenes" in out and "ok: 3 results" in out
+
+
+@pytest.mark.parametrize("option", ["scenes", "predictions"])
+def test_a_folder_that_is_not_there_is_not_passed_over(once: Made, tmp_path: Path, option: str) -> None:
+    with pytest.raises(UserError, match=f"--{option}: expected a folder, found .*typo, which is none"):
+        check(NUMBER, seasons=once.seasons, **{option: tmp_path / "typo"})
 
 
 def test_before_the_reveal_nothing_secret_is_shown(once: Made, said: Any) -> None:

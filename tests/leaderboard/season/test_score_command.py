@@ -16,7 +16,7 @@ from spike4dgs.benchmark.method import Budget
 from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scene
-from spike4dgs.cli.season import check, reveal, score
+from spike4dgs.cli.season import check, predict, reveal, score
 from spike4dgs.leaderboard.season.results import predict_all, read_results, write_result
 from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
 
@@ -120,6 +120,11 @@ def test_installed_methods_are_run_and_scored(made: Made) -> None:
     (result,) = read_results(made.seasons, made.season)
     assert (result.name, result.submitted_as) == ("nearest-view", "method")
     assert {cell["budget"] for cell in result.record["scenes"].values()} == {0.02}
+
+
+def test_no_method_is_no_prediction(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--methods: expected names of methods, found none"):
+        predict((tmp_path,), methods=(), out=tmp_path / "out")
 
 
 def test_a_failing_method_is_named(once: Made, tmp_path: Path) -> None:

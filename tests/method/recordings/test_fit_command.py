@@ -11,6 +11,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +24,8 @@ from PIL import Image
 from small_scenes import write_small_scene
 from toy_world import GAIN, RATE_HZ, ToyWorld
 
+from spike4dgs.benchmark import plugins
+from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
 from spike4dgs.benchmark.method import FitRequest, get_method, make_budget
@@ -29,8 +33,9 @@ from spike4dgs.benchmark.metrics.pose_error import align_cameras, pose_errors
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.apart.training_part import write_training_part
 from spike4dgs.benchmark.runs.record import read_record
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.manifest import write_manifest
-from spike4dgs.benchmark.scene.scene import open_scene
+from spike4dgs.benchmark.scene.scene import TrainingScene, open_scene
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
 from spike4dgs.benchmark.spikes.folder import open_stream_folder, write_stream_folder
 from spike4dgs.benchmark.spikes.gaps import Gap
@@ -192,14 +197,31 @@ def test_a_held_out_camera_whose_stream_is_kept_back_is_taken_as_given(small_sce
     assert view == HeldOutView(part.cameras["cam_03"])
 
 
-def test_nothing_of_a_model_that_was_removed_stays_beside_a_new_one(fitted: Path, recorded: Path, tmp_path) -> None:
+class Gray:
+    """A method whose models cannot be saved: they show 0.4 at any size."""
+
+    name, params = "gray", dict[str, Any]()
+
+    def fit(self, scene: TrainingScene, request: FitRequest) -> "Gray":
+        return self
+
+    def render(self, camera: Camera, t_us: float) -> Float32:
+        return np.full((camera.height, camera.width), 0.4, np.float32)
+
+
+def test_a_model_that_cannot_be_saved_has_reports_and_no_file_of_an_earlier_one_beside(
+    fitted: Path, recorded: Path, tmp_path: Path, no_sheet: None, monkeypatch
+) -> None:
+    entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: {"gray": Gray()})
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
     out = Path(shutil.copytree(fitted, tmp_path / "out"))
     (out / MODEL).unlink()
     (out / PREDICTIONS).mkdir(exist_ok=True)
     (out / PREDICTIONS / "prediction.json").write_text("{}")
-    arguments = ["fit", str(recorded), "--method", "nearest-view", "--out", str(out), "--poses", "given"]
-    assert main(arguments) == 2, "its models cannot be saved"
-    assert not [path.name for path in out.iterdir() if path.name not in (".lock", "work")]
+    arguments = ["fit", str(recorded), "--method", "gray", "--out", str(out), "--poses", "given"]
+    assert main(arguments) == 0
+    assert {path.name for path in out.iterdir()} == {".lock", VIDEO, SHEET, REPORT}, "no model: it cannot be saved"
+    assert "cannot be saved" in (out / REPORT).read_text()
 
 
 def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, no_sheet: None, capsys) -> None:
@@ -297,7 +319,7 @@ def test_a_second_run_makes_only_the_reports_again(fitted: Path, recorded: Path,
 def test_what_cannot_be_done_is_said(fitted: Path, recorded: Path, tmp_path: Path, capsys) -> None:
     for arguments, message in (
         (("--out", str(fitted), "--seed", "1"), "another --out, or remove it"),
-        (("--out", str(tmp_path / "a"), "--method", "nearest-view"), "a method whose models can be saved"),
+        (("--out", str(recorded)), "expected a folder for the results of a fit, found a recording (scene.json)"),
         (("--out", str(tmp_path / "b"), "--method", "magic"), "one of "),
         (("--out", str(tmp_path / "c"), "--budget", "much"), "--budget"),
         (("--out", str(tmp_path / "e"), "--set", "images.time_spacing_ticks=0"), "_ticks and max_times of 1"),

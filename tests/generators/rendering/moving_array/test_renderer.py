@@ -41,6 +41,12 @@ def test_a_key_is_mitsubas_own_rendering_by_cameras_where_they_are_then(r):
     assert np.abs(fixed - truth).mean() > 3 * np.abs(key - truth).mean()
 
 
+def test_an_array_that_looks_away_from_everything_has_keys(r):
+    path = array_path(r.world.rig, Physics(array_rotation=1000.0), [0])
+    away = MovingArrayRenderer(r.world, r.cameras, path=path, seed=0, spp=1, background_spp=1)
+    assert np.isfinite(away.keys(0.2)).all() and np.isfinite(away.speeds(0.2)).all()
+
+
 def test_two_keys_have_noise_of_their_own_and_a_key_is_the_same_again(r):
     first, other = r.keys(T_S), MovingArrayRenderer(r.world, r.cameras, path=r.path, seed=0, spp=32, background_spp=128)
     assert np.array_equal(first, other.keys(T_S))
