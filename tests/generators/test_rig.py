@@ -13,7 +13,7 @@ from spike4dgs.generators.worlds import WORLDS
 
 @pytest.fixture(scope="module")
 def world():
-    return WORLDS["car"].build(0, 0, 0.02)
+    return WORLDS["blank"].build(0, 0, 0.02)
 
 
 def path_of(world, **physics):

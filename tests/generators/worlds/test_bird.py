@@ -1,4 +1,4 @@
-"""The bird's wings and tail, and the turntable's hard variants."""
+"""The bird's wings and tail."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 from built_worlds import built
 
 from spike4dgs.generators.rig import cameras
-from spike4dgs.generators.worlds import turntable
 from spike4dgs.generators.worlds.parts import bird_body
 
 BEATS = [bird_body.Beat(), bird_body.Beat(20.0, 0.9, phase=2.0)]
@@ -83,17 +82,3 @@ def test_wings_and_tail_are_attached_to_the_body():
     for t in np.linspace(0, 0.1, 9):
         for root in (left_wing(bird_body.Beat(), t)[0, 0], bird_body.tail_points(bird_body.Beat(), t)[0]):
             assert np.linalg.norm(skin - root, axis=1).min() < 0.03
-
-
-@pytest.mark.parametrize("variant", range(8))
-def test_odd_turntables_are_hard(variant):
-    world = built("turntable", variant)
-    turns = world.notes["turns_per_s"]
-    low, high = (20, 25) if variant % 2 else (4, 5.5)
-    assert low <= abs(turns) <= high and (variant or turns == 5)
-    step = 1e-6
-    rim = np.array([turntable.DISC_RADIUS_M, 0, 0, 1])
-    moved = (world.poses(0.01 + step)["disc"] - world.poses(0.01)["disc"]) @ rim
-    speed = np.linalg.norm(moved) / step
-    assert speed == pytest.approx(world.notes["speed_m_s"], rel=1e-4)
-    assert speed / 30 >= world.notes["length_m"] / 4

@@ -1,4 +1,4 @@
-"""People run and ride, and wheels roll, as real ones do."""
+"""People run and ride as real ones do; `test_worlds.py` tells that wheels roll."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from built_worlds import built
 
-from spike4dgs.generators.worlds import bicycle, jaywalk, motor
+from spike4dgs.generators.worlds import jaywalk
 from spike4dgs.generators.worlds.meshes import box
-from spike4dgs.generators.worlds.parts import cycles, figure, van_body
+from spike4dgs.generators.worlds.parts import cycles, figure
 from spike4dgs.generators.worlds.parts.rigid_bodies import owners
 
 
@@ -44,27 +44,10 @@ def test_reach_meets_a_goal_or_stretches_towards_it():
         np.testing.assert_allclose(np.cross(end - start, goal - start), 0, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "wheel", "radius"),
-    [
-        ("bicycle", "front_wheel", bicycle.WHEEL_M),
-        ("motor", "rear_wheel", motor.WHEEL_M),
-        ("van", "rim0", van_body.WHEEL_M),
-    ],
-)
-def test_wheels_roll_without_slipping(name, wheel, radius):
-    """The point of the tyre that touches the ground is at rest."""
-    world = built(name, 0, 0.5)
-    before, after = (world.poses(t)[wheel] for t in (0.03, 0.03 + 1e-6))
-    contact = before[:3, 3] - [0, 0, radius]
-    local = np.linalg.inv(before) @ np.append(contact, 1)
-    assert np.linalg.norm((after @ local)[:3] - contact) / 1e-6 < 1e-3 * world.notes["speed_m_s"]
-
-
 def test_feet_stay_on_the_pedals():
-    world = built("bicycle", 0, 0.5)
+    world = built("bicycle")
     gaps = []
-    for t in np.linspace(0, 0.5, 40):
+    for t in np.linspace(-0.24, 0.26, 40):
         poses = world.poses(t)
         for side in figure.SIDES:
             gaps.append(poses[f"rider_{side}_shoe"][:3, 3] - poses[f"{side}_pedal"][:3, 3])
