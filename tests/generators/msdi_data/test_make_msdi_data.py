@@ -17,12 +17,16 @@ from spike4dgs.generators.msdi_data.make_msdi_data import MakeBursts
 from spike4dgs.generators.msdi_data.rigs import jittered_cameras
 from spike4dgs.generators.msdi_data.wide_rigs import layout, wide_cameras
 from spike4dgs.generators.rig import cameras
-from spike4dgs.generators.worlds import WORLDS
+from spike4dgs.generators.worlds import WORLDS, WorldScene
 from spike4dgs.method.msdi.training_data import points_of
 
 
-def test_jittered_rigs_stay_near_the_worlds_own() -> None:
-    world = WORLDS["turntable"].build(0, 13, 0.1)
+@pytest.fixture(scope="module")
+def world() -> WorldScene:
+    return WORLDS["turntable"].build(0, 13, 0.1)
+
+
+def test_jittered_rigs_stay_near_the_worlds_own(world: WorldScene) -> None:
     own = cameras(world, 104, 64)
     none = jittered_cameras(world, 104, 64, np.random.default_rng(0), 0.0)
     for a, b in zip(own, none, strict=True):
@@ -50,8 +54,7 @@ def test_the_widest_pair_of_a_layout_is_one_apart() -> None:
         assert places.shape == (9, 2) and np.isclose(distances.max(), 1)
 
 
-def test_rigs_have_the_baselines_that_they_should_and_see_the_target() -> None:
-    world = WORLDS["turntable"].build(0, 13, 0.1)
+def test_rigs_have_the_baselines_that_they_should_and_see_the_target(world: WorldScene) -> None:
     shares, focals = [], []
     for seed in range(60):
         rig = wide_cameras(world, 128, 96, np.random.default_rng(seed))
@@ -73,8 +76,7 @@ def test_rigs_have_the_baselines_that_they_should_and_see_the_target() -> None:
     assert max(focals) > 2.5 * min(focals)
 
 
-def test_without_an_amount_they_stand_where_the_worlds_own_do() -> None:
-    world = WORLDS["car"].build(0, 13, 0.1)
+def test_without_an_amount_they_stand_where_the_worlds_own_do(world: WorldScene) -> None:
     rig = wide_cameras(world, 128, 96, np.random.default_rng(0), 0.0)
     middle = np.mean([camera.center for camera in rig], axis=0)
     away = np.linalg.norm(np.array(world.rig.center) - np.array(world.rig.target))
