@@ -7,25 +7,24 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from rig_text import RIG
 from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
-from spike4dgs.benchmark.spikes.gaps import present, read_gaps
+from spike4dgs.benchmark.spikes.gaps import present
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.cli import main
 from spike4dgs.cli.inspect import _plot_gaps, examine, inspect
 from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.generators.recorder.clip_record import ClipRecord, gaps_of
-from spike4dgs.generators.recorder.frames.gaps import Gap, merged
+from spike4dgs.generators.recorder.frames.gaps import Gap
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.rig_profile import CameraProfile, RigProfile
 
@@ -261,44 +260,6 @@ def test_a_full_disk_is_known_before_the_capture(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / "clip").exists()
 
 
-@pytest.mark.parametrize(
-    ("records", "message"),
-    [
-        ([{"camera": "a", "first_tick": 0, "ticks": 1}], "expected gaps {camera, first_tick, ticks, reason}"),
-        ([{"camera": "b", "first_tick": 0, "ticks": 1, "reason": "x"}], "lie within the clip"),
-        ([{"camera": "a", "first_tick": 9, "ticks": 2, "reason": "x"}], "lie within the clip"),
-        ([{"camera": "a", "first_tick": 1, "ticks": 0, "reason": "x"}], "lie within the clip"),
-        ([{"camera": "a", "first_tick": t, "ticks": 2, "reason": "x"} for t in (3, 2)], "do not overlap"),
-        (3, "gaps {camera"),
-    ],
-)
-def test_damaged_lists_of_gaps(records: list[dict[str, object]], message: str) -> None:
-    with pytest.raises(UserError) as error:
-        read_gaps(records, {"a": 10}, Path("scene.json"))
-    assert message in str(error.value)
-
-
-# ---------------------------------------------------------------- gaps
-
-
-@settings(deadline=None)
-@given(
-    st.lists(
-        st.builds(
-            Gap, st.sampled_from("ab"), st.integers(-5, 25), st.integers(0, 9), st.sampled_from(("stall", "overflow"))
-        )
-    )
-)
-def test_merged_gaps_cover_the_same_ticks_once(gaps: list[Gap]) -> None:
-    found = merged(gaps, 20)
-    for camera in "ab":
-        covered = sorted(t for g in found if g.camera == camera for t in range(g.first_tick, g.stop_tick))
-        expected = {t for g in gaps if g.camera == camera for t in range(g.first_tick, g.stop_tick) if 0 <= t < 20}
-        assert covered == sorted(expected)
-    for a, b in zip(found[:-1], found[1:], strict=True):
-        assert a.camera != b.camera or a.stop_tick < b.first_tick or a.reason != b.reason
-
-
 # ---------------------------------------------------------------- inspect
 
 
@@ -315,8 +276,8 @@ def test_rates_and_intervals_leave_gaps_out() -> None:
 def test_inspect_plots_each_gap_at_its_ticks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from matplotlib.figure import Figure
 
-    profile = rig()
-    root = write_clip(tmp_path / "clip", profile, streams(profile), ClipRecord(TICKS, GAPS, SYNC))
+    profile = replace(rig(), cameras=rig().cameras[:2])
+    root = write_clip(tmp_path / "clip", profile, streams(profile), ClipRecord(TICKS, GAPS[:2], SYNC))
     axis = Figure().subplots()
     _plot_gaps(axis, open_scene(root, allow_gaps=True).stream("cam_00"))
     spans = [patch.get_window_extent().transformed(axis.transData.inverted()) for patch in axis.patches[1:]]
@@ -325,4 +286,4 @@ def test_inspect_plots_each_gap_at_its_ticks(tmp_path: Path, capsys: pytest.Capt
     assert texts == ["overflow: 1 gap(s), 3 ticks", "unplugged: 1 gap(s), 2 ticks"]
     assert inspect(root, out=tmp_path / "out", allow_gaps=True) == 0
     assert "cam_00: no data in ticks [4, 7): 3 ticks, overflow" in capsys.readouterr().out
-    assert len(list((tmp_path / "out" / "clip").glob("*.png"))) == 3
+    assert len(list((tmp_path / "out" / "clip").glob("*.png"))) == 2

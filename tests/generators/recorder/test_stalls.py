@@ -102,8 +102,8 @@ def check_file(path: Path, source: UInt8, camera: CameraClip, n_ticks: int) -> N
     assert camera.stats.lost_ticks + int(zeros.sum()) == n_ticks, "what was sent is written, or is in a gap"
 
 
-@pytest.mark.parametrize("stall_s", [0.1, 2.0])
-def test_a_stall_shorter_than_the_buffer_loses_nothing(tmp_path: Path, stall_s: float) -> None:
+def test_a_stall_shorter_than_the_buffer_loses_nothing(tmp_path: Path) -> None:
+    stall_s = 1.2  # twice as long as the cameras themselves keep data
     clip, _ = run(tmp_path / "clip", stall_s + 0.3, stall_s, buffer_s=stall_s + 1.0)
     assert clip.complete and not clip.interrupted and clip.n_ticks == round((stall_s + 0.3) * FPS)
     waited = max(c.stats.backlog for c in clip.cameras) * BLOCK / (FPS * FRAME)

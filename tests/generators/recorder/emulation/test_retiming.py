@@ -42,8 +42,8 @@ def twin(fired, place, gain, clock):
     begin = clock.shared(0)
     low = math.floor(gain * np.interp(begin, knots, charges))
     out, last_tick = np.zeros(n, np.uint8), -1
-    for level in range(low + 1, math.ceil(gain * charges[-1])):
-        tick = math.floor(clock.local(np.interp(level / gain, charges, knots)))
+    levels = np.arange(low + 1, math.ceil(gain * charges[-1]))
+    for tick in np.floor(clock.local(np.interp(levels / gain, charges, knots))).astype(int):
         chosen = max(tick, last_tick + 1)
         if 0 <= tick and chosen < n and chosen <= tick + 1:
             out[chosen], last_tick = 1, chosen

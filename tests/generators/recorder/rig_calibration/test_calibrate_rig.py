@@ -83,7 +83,7 @@ def test_the_command_finds_the_array_from_spikes(clip, tmp_path, capsys):
 
 
 def test_the_command_estimates_what_is_asked_of_it(clip, tmp_path):
-    arguments = ["calibrate-rig", str(clip), "--out", str(tmp_path), "--views", "12", "--window-ticks", "40"]
+    arguments = ["calibrate-rig", str(clip), "--out", str(tmp_path), "--views", "6", "--window-ticks", "40"]
     assert main([*arguments, "--shared-focal", "--centered", "--distortion"]) == 0
     found = read_calibration(tmp_path / "calibration.toml", WIDTH, HEIGHT).values()
     assert len({(c.fx, c.cx, c.cy) for c in found}) == 1
