@@ -14,6 +14,7 @@ from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.exchange.camera_files import read_camera_files
+from spike4dgs.benchmark.scene.calibration import estimate
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.cli import main
@@ -101,11 +102,9 @@ def test_the_shrunk_camera_sees_points_where_the_shrunk_frames_show_them(tmp_pat
 
 
 def test_its_calibration_is_that_of_the_sensors(tmp_path: Path) -> None:
-    write_scene(tmp_path)
-    assert main(["calibrate", str(tmp_path / "scene"), "--out", str(tmp_path / "maps")]) == 0
-    found = np.load(next(tmp_path.glob("maps/**/cam_00.npz")))
+    found = estimate(write_scene(tmp_path).recordings("cam_00"))
     true = np.load(tmp_path / "scene/truth/cam_00.npz")
-    assert np.abs(found["gain"] / true["gain"] - 1).mean() < 0.01
+    assert np.abs(found.gain / true["gain"] - 1).mean() < 0.01
 
 
 def test_the_same_footage_gives_the_same_scene_and_another_seed_another(tmp_path: Path) -> None:

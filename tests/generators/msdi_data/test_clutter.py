@@ -17,7 +17,7 @@ def poses(world: WorldScene, t_s: float) -> np.ndarray:
     return np.stack(list(world.poses(t_s).values()))
 
 
-@lru_cache(maxsize=1)
+@lru_cache
 def build(name: str, variant: int = 13) -> WorldScene:
     return TRAINING_WORLDS[name].build(0, variant, 0.1)
 

@@ -16,7 +16,7 @@ from spike4dgs.generators.worlds.parts.rigid_bodies import GRAVITY_M_S2, SOFT_M,
 from spike4dgs.generators.worlds.textures import _font
 
 MODULES = {"bricks": bricks, "chips": chips}
-CASES = [("bricks", 0), ("bricks", 1), ("bricks", 2), ("chips", 0), ("chips", 1), ("chips", 5)]
+CASES = [("bricks", 0), ("bricks", 2), ("chips", 0), ("chips", 5)]
 
 
 @lru_cache
@@ -77,7 +77,7 @@ def test_energy_falls_except_for_what_contacts_return(name, variant):
     assert total[-1] < 0.95 * total[0]
 
 
-@pytest.mark.parametrize("variant", [0, 1, 5])
+@pytest.mark.parametrize("variant", [0, 5])
 def test_the_middle_of_all_chips_falls_on_a_parabola_until_the_first_lands(variant):
     _, bodies, path = simulated("chips", variant)
     reach = np.hypot(chips.RADIUS_M, chips.THICK_M / 2)
@@ -162,7 +162,7 @@ def test_bodies_stay_rigid_and_do_not_enter_each_other_or_the_table(name, varian
         assert depth[others].max() < SOFT_M
 
 
-@pytest.mark.parametrize("variant", [0, 1, 2])
+@pytest.mark.parametrize("variant", [0, 2])
 def test_the_ball_and_the_bricks_stop_at_each_other_and_at_the_room(variant):
     world, _, path = simulated("bricks", variant)
     parts = [part for name, part in world.static.items() if name.startswith(("wall", "book"))]
@@ -233,7 +233,7 @@ def test_the_wall_bursts_in_the_same_way_in_clips_of_any_length():
     np.testing.assert_allclose(short.moving_points(0.012), long.moving_points(0.052), atol=1e-9)
 
 
-@pytest.mark.parametrize("variant", [0, 1, 2])
+@pytest.mark.parametrize("variant", [0, 2])
 def test_the_ball_meets_the_wall_35_ms_before_the_middle(variant):
     world, _, path = simulated("bricks", variant)
     wall = [world.deforming["brick"].vertices(t) for t in (0.0, 0.0149, 0.0152, 0.05)]
