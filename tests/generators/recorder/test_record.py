@@ -66,15 +66,6 @@ def test_an_emulated_capture_is_the_scene_bit_by_bit(scene, tmp_path, capsys, ho
     assert out.index("armed") < out.index("triggered") < out.index("closed") < out.index("80 ticks of 4 cameras")
 
 
-def test_a_capture_has_the_scenes_dead_ticks(scene, tmp_path):
-    shutil.copytree(scene, tmp_path / "dead")
-    edit_json(tmp_path / "dead/scene.json", lambda meta: meta["sensor"].update(dead_ticks=0.5))
-    write_manifest(tmp_path / "dead")
-    assert record("--emulate", tmp_path / "dead", "--out", tmp_path / "out") == 0
-    captured = open_scene(tmp_path / "out")
-    assert captured.stream("cam_00").dead_ticks == open_scene(tmp_path / "dead").stream("cam_00").dead_ticks == 0.5
-
-
 @pytest.mark.usefixtures("no_images")
 def test_a_benchmark_on_the_capture_gives_the_scores_of_the_scene(scene, tmp_path):
     assert record("--emulate", scene, "--out", tmp_path / "pattern-0") == 0  # named as the scene is
@@ -123,13 +114,16 @@ def test_a_recording_ends_where_the_whole_array_fails(scene, tmp_path, monkeypat
     same_streams(capture, open_scene(scene), 30)
 
 
-def test_a_recording_has_the_splits_of_its_scene(scene, tmp_path):
+def test_a_recording_has_the_splits_and_the_dead_ticks_of_its_scene(scene, tmp_path):
     """Poses that are a little wrong would break ties of distances in another way."""
     copy = Path(shutil.copytree(scene, tmp_path / "copy"))
     edit_json(copy / "scene.json", lambda meta: meta["splits"]["corner"]["train"].pop())
+    edit_json(copy / "scene.json", lambda meta: meta["sensor"].update(dead_ticks=0.5))
     write_manifest(copy)
     assert record("--emulate", copy, "--out", tmp_path / "x") == 0
-    assert open_scene(tmp_path / "x").meta["splits"] == open_scene(copy).meta["splits"]
+    found, source = open_scene(tmp_path / "x"), open_scene(copy)
+    assert found.meta["splits"] == source.meta["splits"]
+    assert found.stream("cam_00").dead_ticks == source.stream("cam_00").dead_ticks == 0.5
 
 
 def test_missing_cameras_are_an_error_and_leave_no_files(scene, tmp_path, monkeypatch, capsys):

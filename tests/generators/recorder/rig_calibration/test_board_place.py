@@ -12,7 +12,6 @@ from built_worlds import built
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import look_at
-from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
 from spike4dgs.generators.recorder.rig_calibration.board_clip import DISTANCE_M, array
 from spike4dgs.generators.recorder.rig_calibration.board_place import LEAST_SEEN, place_board
@@ -55,11 +54,3 @@ def test_cameras_that_share_no_view_are_refused():
     ]
     with pytest.raises(UserError, match="cam_0, cam_2 without it .*; calibrate groups of cameras that share a view"):
         place_board(apart, 8, 5)
-
-
-def test_the_command_says_what_to_calibrate_with(small_scene, tmp_path, capsys):
-    out = tmp_path / "b"
-    assert main(["board-clip", "--out", str(out), "--seconds", "0.001", "--like", str(small_scene)]) == 0
-    printed = capsys.readouterr().out
-    square = open_scene(out).meta["source"]["square_m"]
-    assert f"calibrate-rig needs --columns 8 --rows 5 --square-m {square:g}" in printed

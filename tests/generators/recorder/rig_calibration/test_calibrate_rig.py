@@ -116,9 +116,11 @@ def test_a_lens_is_refused_before_anything_is_written(tmp_path):
     assert not (tmp_path / "b").exists()
 
 
-def test_any_array_films_the_board(small_scene, tmp_path):
+def test_any_array_films_the_board(small_scene, tmp_path, capsys):
     out = tmp_path / "b"
     assert main(["board-clip", "--out", str(out), "--seconds", "0.001", "--like", str(small_scene)]) == 0
+    square = open_scene(out).meta["source"]["square_m"]
+    assert f"calibrate-rig needs --columns 8 --rows 5 --square-m {square:g}" in capsys.readouterr().out
     found, like = open_scene(out).cameras, open_scene(small_scene).cameras
     assert list(found) == list(like)
     for first, second in itertools.combinations(like, 2):
