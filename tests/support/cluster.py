@@ -12,15 +12,22 @@ from dummy_methods import CountMethod, WaitingMethod, run, wait_for
 
 
 @contextmanager
-def dask_cluster(folder: Path, workers: int, **settings: str) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Yield the address of a scheduler that has its workers, and its process. `settings` are of DASK_DISTRIBUTED."""
+def dask_cluster(
+    folder: Path, workers: int, nanny: bool = True, **settings: str
+) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Yield the address of a scheduler that has its workers, and its process. `settings` are of DASK_DISTRIBUTED.
+
+    Without a nanny a worker that dies is not started again, and there may be only one.
+    """
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{s.getsockname()[1]}"
     path = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
+    settings |= {"WORKER__PROFILE__ENABLED": "False"}  # it looks at every thread a hundred times a second
     env = {**os.environ, "PYTHONPATH": path, **{f"DASK_DISTRIBUTED__{k}": v for k, v in settings.items()}}
     scheduler = ["scheduler", "--host", address, "--no-dashboard", "--no-jupyter"]
     worker = ["worker", address, "--nworkers", str(workers), "--nthreads", "1", "--no-dashboard"]
+    worker += [] if nanny else ["--no-nanny"]
     worker += ["--memory-limit", "0", "--local-directory", str(folder)]
     logs = [open(folder / f"{name}.log", "wb") for name in ("scheduler", "worker")]
     started = [
@@ -45,4 +52,4 @@ def dask_cluster(folder: Path, workers: int, **settings: str) -> Iterator[tuple[
 if __name__ == "__main__":  # a caller: OUT SCENE SCHEDULER FOLDER
     out, scene, scheduler, folder = sys.argv[1:]
     methods = (CountMethod("quick"), WaitingMethod("waiting", Path(folder)))
-    run(Path(out), [Path(scene)], *methods, seeds=2, metrics=("psnr",), scheduler=scheduler)
+    run(Path(out), [Path(scene)], *methods, metrics=("psnr",), scheduler=scheduler)

@@ -137,14 +137,18 @@ class Swaps(CountMethod):
 
 
 class ReadsPath(CountMethod):
-    """Reads a file by a path that it knows."""
+    """Reads a file by a path that it knows, and writes down the error, if any."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, report: Path) -> None:
         super().__init__("reads-path")
-        self._path = path
+        self._path, self._report = path, report
 
     def fit(self, scene: TrainingScene, request: FitRequest) -> Any:
-        self._path.read_bytes()
+        try:
+            self._path.read_bytes()
+            self._report.write_text("read")
+        except OSError as e:
+            self._report.write_text(type(e).__name__)
         return super().fit(scene, request)
 
 

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import dummy_methods
-import nosy_methods
 import pytest
 from changes import edit_json, files_in
 from dummy_methods import CountMethod, FailingMethod, WorkerKiller, prediction_bytes, run, wait_for, without_timings
-from nosy_methods import DiesBesideItsChild, LacksWeights, LooksAround, PlaysBack, Refines, Swaps
+from nosy_methods import DiesBesideItsChild, LacksWeights, LooksAround, PlaysBack, ReadsPath, Refines, Swaps
 from rich.console import Console
 from small_scenes import write_small_scene
 
@@ -62,17 +61,11 @@ def test_the_bits_are_those_of_a_fit_in_this_process(small_scene: Path, tmp_path
 
 def test_the_held_out_stream_is_not_next_to_the_others(small_scene: Path, tmp_path: Path) -> None:
     """Where workers fit apart too."""
-    methods = PlaysBack(), CountMethod()
-    found, counts = run(tmp_path / "here", [small_scene], *methods, **PSNR)
-    cell = cell_of([found])
+    cell = cell_of(run(tmp_path / "here", [small_scene], PlaysBack(), **PSNR))
     assert cell["status"] == "ok" and cell["metrics"]["psnr"] > 25, "a method that looks for it in the scene finds it"
-    lost, other = run(tmp_path / "apart", [small_scene], *methods, workers=2, **APART)
-    cell = cell_of([lost])
+    cell = cell_of(run(tmp_path / "apart", [small_scene], PlaysBack(), workers=2, **APART))
     assert cell["status"] == "failed" and "not enough values to unpack" in cell["error"]
     assert not (tmp_path / "apart/predictions/plays-back/pattern-0").exists()
-    assert without_timings(other) == without_timings(counts)
-    same = "predictions/counts"
-    assert prediction_bytes(tmp_path / "apart" / same) == prediction_bytes(tmp_path / "here" / same)
 
 
 def test_what_a_fit_sees_has_neither_the_held_out_camera_nor_how_the_scene_was_made(
@@ -132,14 +125,14 @@ def test_a_fit_gets_no_token_of_its_caller(name: str, tmp_path: Path, monkeypatc
     assert "secret" not in "".join(_environment(tmp_path).values())
 
 
-@pytest.mark.parametrize("split", ["corner", "views-3"])
-def test_other_splits_hold_out_their_own_cameras(split: str, tmp_path: Path) -> None:
+def test_other_splits_hold_out_their_own_cameras(tmp_path: Path) -> None:
+    """See also `test_training_part.py`."""
     scene, seen = write_small_scene(tmp_path / "scene", splits=True), tmp_path / "seen.json"
     with open(os.devnull, "w") as nothing:
-        opened = open_scene(scene, split=split)
+        opened = open_scene(scene, split="corner")
         (record,) = run_matrix([opened], [LooksAround(seen)], Settings(tmp_path / "o", **APART), Console(file=nothing))
         (here,) = run_matrix([opened], [CountMethod()], Settings(tmp_path / "h", **PSNR), Console(file=nothing))
-    assert record["mean"] == here["mean"] and record["dataset"]["split"] == split
+    assert record["mean"] == here["mean"] and record["dataset"]["split"] == "corner"
     streams = [name for name in json.loads(seen.read_text())["files"] if name.startswith("spikes/")]
     assert streams == [f"spikes/{camera}.dat" for camera in opened.train]
 
@@ -162,8 +155,7 @@ def test_refined_views_are_sent_after_the_images_are_taken(small_scene: Path, tm
 
 
 def test_failures_come_back_as_from_this_process(small_scene: Path, tmp_path: Path) -> None:
-    user = UserError("here: expected light, found none; add some")
-    methods = [FailingMethod("value", ValueError("no luck")), FailingMethod("user", user), LacksWeights("weights")]
+    methods = FailingMethod("value", ValueError("no luck")), LacksWeights("weights")
     here = run(tmp_path / "here", [small_scene], *methods, **PSNR)
     apart = run(tmp_path / "apart", [small_scene], *methods, **APART)
     assert [r["scenes"] for r in apart] == [r["scenes"] for r in here]
@@ -193,17 +185,20 @@ def test_a_process_that_lies_fails_its_cell(small_scene: Path, tmp_path: Path, l
     assert not (tmp_path / "out/predictions/counts/pattern-0").exists()
 
 
-def test_a_link_in_the_place_of_an_image_is_refused(small_scene: Path, tmp_path: Path) -> None:
-    truth = small_scene / "images/cam_03/000020.exr"
-    cell = cell_of(run(tmp_path / "out", [small_scene], Swaps(truth), **APART))
-    assert cell["status"] == "failed" and "expected an image of a target" in cell["error"]
+def test_progress_is_passed_on_and_a_link_in_the_place_of_an_image_is_refused(
+    small_scene: Path, tmp_path: Path
+) -> None:
+    method, steps = Swaps(small_scene / "images/cam_03/000020.exr"), list[tuple[int, int, str]]()
+    job = Job(method, open_scene(small_scene), 0, "cpu", Budget())
+    with pytest.raises(UserError, match="expected an image of a target"):
+        fit_apart(job, [tmp_path / "out"], tmp_path / "model", tmp_path / "work", lambda *a: steps.append(a), print)
+    assert steps[-1] == (4, 4, "step 3") and not (tmp_path / "out").exists()
 
 
 def test_a_process_that_is_killed_fails_its_cell_and_the_next_run_goes_on(small_scene: Path, tmp_path: Path) -> None:
     (tmp_path / "bullet").touch()
     killer = WorkerKiller("killer", tmp_path)
-    killed, other = run(tmp_path / "out", [small_scene], killer, CountMethod(), **APART)
-    assert "its end by signal 9" in cell_of([killed])["error"] and cell_of([other])["status"] == "ok"
+    assert "its end by signal 9" in cell_of(run(tmp_path / "out", [small_scene], killer, **APART))["error"]
     console = Console(file=(text := io.StringIO()), width=200)
     again = run_matrix([open_scene(small_scene)], [killer], Settings(tmp_path / "out", **APART), console)
     assert cell_of(again)["status"] == "ok" and "resuming after" in text.getvalue(), "notes reach the caller"
@@ -253,11 +248,6 @@ def test_the_process_ends_with_its_caller_and_removes_the_part(small_scene: Path
         text = process.stderr.read().decode()  # ends when no process holds the pipe
         assert text.count("KeyboardInterrupt") == 1, text
     process.stderr.close()
-    if how == "kill":
-        (tmp_path / "go").touch()
-        waits = dummy_methods.WaitingMethod("waits", tmp_path)
-        assert cell_of(run(tmp_path / "out", [small_scene], waits, **APART))["status"] == "ok"
-        assert files_in(tmp_path / "out/work") == {}
 
 
 def test_a_fit_has_a_part_of_its_own_while_a_killed_fits_process_still_ends(small_scene: Path, tmp_path: Path) -> None:
@@ -270,20 +260,14 @@ def test_a_fit_has_a_part_of_its_own_while_a_killed_fits_process_still_ends(smal
     assert files_in(work) == {}
 
 
-def test_the_part_is_among_the_work_whatever_disk_that_is_on(small_scene: Path, tmp_path: Path) -> None:
+def test_the_part_is_among_the_work_whatever_disk_that_is_on(small_scene: Path) -> None:
     """Beside the scene a method would find the held-out stream by `..`, and a killed fit would leave it there."""
     other = Path("/dev/shm")
     if not other.is_dir() or other.stat().st_dev == small_scene.stat().st_dev:
         pytest.skip("no second disk here")
-    seen, steps = tmp_path / "seen.json", list[tuple[int, int, str]]()
-    job = Job(LooksAround(seen), open_scene(small_scene), 0, "cpu", Budget())
-    with tempfile.TemporaryDirectory(dir=other) as folder:
-        out = Path(folder)
-        fit_apart(job, [out / "images"], out / "model", out / "work", lambda *a: steps.append(a), print)
-        assert len(list((out / "images").rglob("*.exr"))) == 3 and not (out / "work").exists()
-        found = json.loads(seen.read_text())
-        assert Path(found["folder"]).parent == out / "work" and found["names"]["spikes/cam_00.dat"] == 1
-    assert steps[-1] == (4, 4, "step 3"), "progress is passed on"
+    job = Job(CountMethod(), open_scene(small_scene), 0, "cpu", Budget())
+    with tempfile.TemporaryDirectory(dir=other) as work, _training_part(job, Path(work)) as part:
+        assert part.parent == Path(work) and (part / "spikes/cam_00.dat").stat().st_nlink == 1
 
 
 def has_namespaces() -> bool:
@@ -294,15 +278,12 @@ def has_namespaces() -> bool:
 @pytest.mark.skipif(not has_namespaces(), reason="needs unshare and user namespaces")
 def test_in_a_container_not_even_a_known_path_is_read(small_scene: Path, tmp_path: Path) -> None:
     """The command of the documentation: an empty folder lies over the scene's."""
-
-    method = nosy_methods.ReadsPath(small_scene / "spikes/cam_03.dat")
-    assert cell_of(run(tmp_path / "process", [small_scene], method, **APART))["status"] == "ok", "a process reads it"
+    stream, found = small_scene / "spikes/cam_03.dat", tmp_path / "found"
     unshare = "unshare --user --map-root-user --mount --net --pid --fork --kill-child --mount-proc"
     fence = f"""{unshare} sh -c 'mount -t tmpfs none "$0" && exec "$@"' {small_scene}"""
-    settings = {"apart": Apart(fence), **PSNR}
-    cell = cell_of(run(tmp_path / "container", [small_scene], method, **settings))
-    assert cell["status"] == "failed" and "FileNotFoundError" in cell["error"]
-    assert cell_of(run(tmp_path / "container", [small_scene], CountMethod(), **settings))["status"] == "ok"
+    cell = cell_of(run(tmp_path / "out", [small_scene], ReadsPath(stream, found), apart=Apart(fence), **PSNR))
+    assert cell["status"] == "ok" and found.read_text() == "FileNotFoundError"
+    assert stream.is_file(), "outside it is there"
 
 
 def test_a_method_of_a_package_travels_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:

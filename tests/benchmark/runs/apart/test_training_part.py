@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from changes import files_in
 from release_scenes import write_release_scenes
+from small_scenes import write_small_scene
 
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.runs.apart import training_part
@@ -38,6 +39,15 @@ def test_recordings_are_those_that_the_method_is_given(scene: Scene, tmp_path: P
         assert [r is not None for r in found.recordings] == [bool(expected - streams)] * 3
         for camera in part.train:
             assert (part.root / f"spikes/{camera}.dat").stat().st_nlink == 1, "a fit cannot write into the scene"
+
+
+def test_other_splits_have_the_streams_of_their_own_training_cameras(tmp_path: Path) -> None:
+    root = write_small_scene(tmp_path / "scene", splits=True)
+    for split, held_out in (("corner", "cam_00"), ("views-3", "cam_03")):
+        opened = open_scene(root, split=split)
+        part = write_nameless_part(opened, tmp_path / split, ())
+        assert recordings(part) == {f"spikes/{camera}.dat" for camera in opened.train}
+        assert part.train == opened.train and part.test == (held_out,)
 
 
 def test_points_are_there_for_those_that_are_given_points(scene: Scene, tmp_path: Path) -> None:
