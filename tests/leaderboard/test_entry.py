@@ -192,9 +192,9 @@ def test_a_ledger_alone_is_a_leaderboard_that_was_being_made(done: Path, tmp_pat
 @pytest.mark.slow
 def test_submitters_at_once_and_killed_lose_nothing(done: Path, tmp_path: Path) -> None:
     """Forks of a process of their own: each fork of one that has run many tests copies tables of gigabytes of pages."""
-    command = [sys.executable, submitters.__file__, str(tmp_path), str(done / "out/results/rough.json"), "8", "12"]
+    command = [sys.executable, submitters.__file__, str(tmp_path), str(done / "out/results/rough.json"), "4", "8"]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
-    expected = rf"8 submitters, 12 kills, \d+ s: exit codes {re.escape(str([0] * 8))}, lost \[\], same boards True\n"
+    expected = rf"4 submitters, 8 kills, \d+ s: exit codes {re.escape(str([0] * 4))}, lost \[\], same boards True\n"
     assert re.fullmatch(expected, found.stdout), found.stdout + found.stderr
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from changes import edit_json
 from dummy_methods import CountMethod, run
-from submissions import Record, board, enter, entry_of, read, submit
+from submissions import Record, board, edit_with_ledger, enter, entry_of, read, refitted, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_file
@@ -119,11 +119,10 @@ def test_seeds_join_only_with_equal_code_parameters_and_verification(record: Rec
         return lambda e: [cell["fitted_with"].update(harness=harness) for cell in e["record"]["scenes"].values()]
 
     other_commit = {**record["harness"], "commit": "ab" * 20}
-    refit = {"psnr": {}, "tolerance_db": 0.3, "bit_equal": True, "costs": {}}
     for change in (
         fitted_with(None),
         fitted_with(other_commit),
-        lambda e: e["verification"].update(label="re-fitted", refit=refit),
+        refitted({}),
         lambda e: e["verification"].update(unverified=["metaiqa"]),
         lambda e: e["record"]["method"].update(version="0.0.1"),
     ):
@@ -144,15 +143,16 @@ def test_a_forged_seed_joins_re_scored_ones_and_never_re_fitted_ones(done: Path,
         (folder / SUMS).write_text("".join(f"{sha256_file(folder / name)}  {name}\n" for name in names))
     record, files = done / "forged.json", {"predictions": forged, "scenes": scenes, "leaderboard": done / "board"}
     assert score(forged, scenes, out=record) == submit(record, **files) == 0
-    enter(done)
+    stated = read(path := enter(done))["record"]
     (row,) = board(done)["boards"][0]["rows"]
     assert row["seeds"] == [0, 1], "of re-scored entries nothing proves who made them: docs/leaderboard.md says so"
     with pytest.raises(UserError, match=r"expected a second fit within 0\.3 dB of the claimed"):
         submit(record, **files, refit=True)
-    enter(done, refit=True)
+    edit_with_ledger(path, refitted({scene: cell["metrics"]["psnr"] for scene, cell in stated["scenes"].items()}))
+    write_boards(done / "board")
     rows = board(done)["boards"][0]["rows"]
     assert [(r["rank"], r["label"], r["seeds"]) for r in rows] == [(1, "re-fitted", [0]), (2, "re-scored", [1])]
-    assert rows[0]["mean"] == json.loads((done / "out/results/tfp+4dgs.json").read_text())["mean"]
+    assert rows[0]["mean"] == stated["mean"]
 
 
 def test_a_method_with_one_failed_scene_is_not_ranked(done: Path, said: Any) -> None:

@@ -109,13 +109,18 @@ def test_a_verification_checks_everything_and_reads_it_once(board: Path, counts:
 
 
 def test_known_entries_are_what_checked_ones_are(board: Path) -> None:
+    """Also shipped ones: archived entries, older metrics, two tracks."""
+    for folder in ("entries/2-small@*", "archive/bird-0-small+3@*", "archive/car-0-paper@*"):
+        (found,) = SHIPPED.glob(folder)
+        shutil.copytree(found, board / found.relative_to(SHIPPED))
+    with (board / entries.LEDGER).open("a") as ledger:
+        ledger.write((SHIPPED / entries.LEDGER).read_text())
     checked = read_all(board, *FOLDERS)
+    assert len({Path(path).parent for path in checked.entries}) == 4 and not checked.refused
     boards = make_boards(checked)
     read_briefs(board)
     assert read_checked(board) == checked
     assert make_boards(read_briefs(board)) == boards
-    board_without = SHIPPED  # of another release: archived entries, older metrics, several tracks
-    assert make_boards(read_briefs(board_without)) == make_boards(read_all(board_without, *FOLDERS))
 
 
 def test_another_version_of_the_code_checks_everything(

@@ -12,8 +12,8 @@ import pytest
 import torch
 from changes import edit_json, exchange, flip_bit
 from dummy_methods import CountMethod, run
-from nosy_methods import Darker, PlaysBack
-from submissions import board, edit_with_ledger, enter, entry_of, files_of, raise_metric, read, submit
+from nosy_methods import Darker
+from submissions import board, edit_with_ledger, enter, entry_of, files_of, raise_metric, read, refitted, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
@@ -94,30 +94,47 @@ def test_options_that_would_verify_nothing_are_refused(done: Path, options: dict
         verify_leaderboard(done / "board", **options)
 
 
-@pytest.fixture
-def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine that has weights for MetaIQA (random ones) and nothing else."""
+@pytest.fixture(scope="module")
+def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
-    folder = tmp_path / "weights"
-    folder.mkdir()
-    torch.save(metaiqa_network().state_dict(), folder / METAIQA.name)
+    path = tmp_path_factory.mktemp("weights") / METAIQA.name
+    torch.save(metaiqa_network().state_dict(), path)
+    return path
+
+
+@pytest.fixture
+def weights(random_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine that has weights for MetaIQA (random ones) and nothing else."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.setenv(VARIABLE, str(folder))
-    return folder
+    monkeypatch.setenv(VARIABLE, str(random_weights.parent))
+    return random_weights
 
 
-def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
+def test_scores_that_need_weights_are_checked_with_these_and_else_stay_as_claimed_and_are_listed(
     done: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, said: Any
 ) -> None:
     run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
+    result = done / "out/results/with.json"
+    honest = result.read_bytes()
+    edit_json(result, lambda record: raise_metric(record, "metaiqa", 0.25))
+    with pytest.raises(UserError, match="expected metaiqa = .* as computed from the files"):
+        enter(done, "with")
+    (done / "other").mkdir()
+    state = torch.load(weights, weights_only=True)
+    torch.save({name: tensor + 0.01 for name, tensor in state.items()}, done / "other" / METAIQA.name)
+    monkeypatch.setenv(VARIABLE, str(done / "other"))
+    assert read(enter(done, "with"))["verification"]["unverified"] == ["metaiqa"], "other weights say nothing"
+    shutil.rmtree(done / "board")
+    result.write_bytes(honest)
     monkeypatch.delenv(VARIABLE)
     entry = read(enter(done, "with", verified=False))
     assert set(entry["verification"]["unverified"]) == {*METRICS} - {"lpips_alex", "lpips_vgg", "lpips_squeeze"}
+    said()
     entry = read(enter(done, "with"))
     assert (entry["verification"]["label"], entry["verification"]["unverified"]) == ("re-scored", ["metaiqa"])
     assert entry["record"]["mean"]["metaiqa"] > 0 and board(done)["boards"][0]["rows"][0]["unverified"] == ["metaiqa"]
     assert "with: re-scored (as claimed, not computed again: metaiqa), rank 1" in said()
-    monkeypatch.setenv(VARIABLE, str(weights))
+    monkeypatch.setenv(VARIABLE, str(weights.parent))
     path = enter(done, "with")
     assert read(path)["verification"]["unverified"] == []
     before = path.read_bytes()
@@ -125,17 +142,8 @@ def test_scores_that_need_absent_weights_stay_as_claimed_and_are_listed(
     assert enter(done, "with").read_bytes() == before, "what was verified stays so"
 
 
-def test_with_the_weights_a_claim_is_checked_and_other_weights_say_nothing(done: Path, weights: Path) -> None:
-    run(done / "out", [done / "s0", done / "s1"], CountMethod("with"))
-    edit_json(done / "out/results/with.json", lambda record: raise_metric(record, "metaiqa", 0.25))
-    with pytest.raises(UserError, match="expected metaiqa = .* as computed from the files"):
-        enter(done, "with")
-    torch.manual_seed(1)
-    torch.save(metaiqa_network().state_dict(), weights / METAIQA.name)
-    assert read(enter(done, "with"))["verification"]["unverified"] == ["metaiqa"]
-
-
-def test_more_weights_than_the_claimants_do_no_harm(done: Path, weights: Path) -> None:
+@pytest.mark.usefixtures("weights")
+def test_more_weights_than_the_claimants_do_no_harm(done: Path) -> None:
     assert read(enter(done))["verification"]["unverified"] == []
 
 
@@ -223,19 +231,12 @@ def edit_truth(**changes: Any) -> Any:
     return lambda entry: entry["verification"]["truth"]["pattern-0"].update(changes)
 
 
-def refitted(psnr: dict[str, float]) -> Any:
-    """State a second fit that reached these values."""
-    refit = {"psnr": psnr, "tolerance_db": 0.3, "bit_equal": False, "costs": {}, "apart": "process"}
-    return lambda entry: entry["verification"].update(label="re-fitted", refit=refit)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda e: raise_metric(e["record"], "psnr", 1), "scene pattern-0, .* as computed from the files"),
         (edit_truth(equal_pixels=0.0), r"scene pattern-0: expected equal_pixels 0\.\d+, as computed again, found 0\.0"),
         (lambda e: e["verification"].update(unverified=["psnr"]), "no unverified metric that these files give"),
-        (edit_truth(equal_images=1), "expected equal_images 0, as computed again, found 1"),
         (lambda e: e["verification"]["truth"].pop("pattern-1"), "expected a check beside the truth of each scored"),
         (refitted({"pattern-0": 20.0}), "expected a second fit of pattern-0, patt"),
         (refitted({"pattern-0": 90.0, "pattern-1": 90.0}), "found 90.00 dB"),
@@ -250,12 +251,17 @@ def test_an_edit_that_agrees_with_itself_is_found_with_the_files(
     assert not problems(entered)
     lines = problems(entered, **files_of(entered))
     assert len(lines) == 1 and "tfp+4dgs.json" in lines[0] and re.search(message, lines[0]), lines
-    if read(entry_of(entered))["verification"]["label"] == "re-scored":  # what the line says to do
-        enter(entered, replace=True)
-        assert not problems(entered, **files_of(entered))
-        before = entry_of(entered).read_bytes()
-        enter(entered, replace=True)
-        assert entry_of(entered).read_bytes() == before, "the same check again changes nothing"
+
+
+def test_an_edited_entry_is_mended_as_its_line_says(entered: Path, problems: Any) -> None:
+    edit_with_ledger(entry_of(entered), edit_truth(equal_images=1))
+    (line,) = (line for line in problems(entered, **files_of(entered)) if "local.json" not in line)
+    assert "expected equal_images 0, as computed again, found 1" in line
+    enter(entered, replace=True)
+    assert not problems(entered, **files_of(entered))
+    before = entry_of(entered).read_bytes()
+    enter(entered, replace=True)
+    assert entry_of(entered).read_bytes() == before, "the same check again changes nothing"
 
 
 def test_a_metric_whose_files_were_missing_is_no_edit(done: Path, problems: Any, said: Any) -> None:
@@ -295,8 +301,10 @@ def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.Mon
 def test_a_label_that_a_second_fit_does_not_bear_out_is_found(
     done: Path, installed: dict[str, Any], said: Any, problems: Any
 ) -> None:
-    enter(done)
-    enter(done, refit=True)
+    path = enter(done)
+    claimed = {scene: cell["metrics"]["psnr"] for scene, cell in read(path)["record"]["scenes"].items()}
+    edit_with_ledger(path, refitted(claimed))
+    enter(done, "bad", verified=False)  # writes the boards anew
     said()
     assert verify_leaderboard(done / "board", **files_of(done)) == 0
     assert "1 scored again, 1 labelled re-fitted and not fitted again (--refit), no problems" in said()
@@ -304,19 +312,6 @@ def test_a_label_that_a_second_fit_does_not_bear_out_is_found(
     installed["tfp+4dgs"] = Darker("tfp+4dgs")
     (line,) = problems(done, **files_of(done), refit=True)
     assert "expected a second fit within 0.3 dB of the claimed" in line
-
-
-def test_the_second_fit_of_a_method_that_opens_the_held_out_stream_fails(
-    done: Path, installed: dict[str, Any], problems: Any
-) -> None:
-    installed["plays-back"] = PlaysBack()
-    (record,) = run(done / "out", [done / "s0", done / "s1"], PlaysBack())
-    claimed = {scene: cell["metrics"]["psnr"] for scene, cell in record["scenes"].items()}
-    edit_with_ledger(enter(done, "plays-back"), refitted(claimed))
-    enter(done, "bad", verified=False)  # writes the boards anew
-    assert not problems(done, **files_of(done)), "its images are as claimed"
-    (line,) = problems(done, **files_of(done), refit=True)
-    assert "plays-back on pattern-0: expected a second fit that ends, found ValueError" in line
 
 
 def test_the_committed_leaderboard_has_no_problems_and_its_boards_follow_from_its_entries(said: Any) -> None:

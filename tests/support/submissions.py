@@ -45,6 +45,12 @@ def edit_with_ledger(path: Path, change: Any) -> None:
     add_line(board, sha256_json(json.loads(path.read_text())), path.relative_to(board).as_posix())
 
 
+def refitted(psnr: Mapping[str, float]) -> Any:
+    """Return the change of an entry that states a second fit with these values, by scene."""
+    refit = {"psnr": dict(psnr), "tolerance_db": 0.3, "bit_equal": False, "costs": {}, "apart": "process"}
+    return lambda entry: entry["verification"].update(label="re-fitted", refit=refit)
+
+
 def files_of(done: Path) -> dict[str, Any]:
     """The options of a run's predictions and scenes."""
     return {"predictions": done / "out/predictions", "scenes": (done / "s0", done / "s1")}

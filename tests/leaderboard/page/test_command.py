@@ -12,7 +12,9 @@ from rich.console import Console
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.cli import main
 from spike4dgs.cli.leaderboard import ranking_table
+from spike4dgs.cli.submit import submit
 from spike4dgs.leaderboard.entry import add_line
+from spike4dgs.leaderboard.page import rows
 from spike4dgs.leaderboard.page.rows import find_board, gather
 from spike4dgs.leaderboard.page.scores import compare_rows, image_scores
 from spike4dgs.leaderboard.tracks import SHIPPED
@@ -61,20 +63,26 @@ def test_a_leaderboard_that_does_not_exist_or_is_empty_is_no_success(
     assert "found none; `run-benchmark` writes one" in capsys.readouterr().err
 
 
-def test_entries_of_ones_own_stand_among_the_published_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A copy of the published entries without one method, and with another record of a second."""
-    own = tmp_path / "own"
+@pytest.fixture
+def few(tmp_path: Path) -> Path:
+    """A copy of the published entries of one track."""
     (folder,) = COMMITTED.glob("entries/2-quick-start@*")
-    shutil.copytree(folder, own / "entries" / folder.name)
-    shutil.copy(COMMITTED / "LEDGER", own)
-    (own / "entries" / folder.name / "tfi+4dgs.json").unlink()
-    path = own / "entries" / folder.name / "tfp+4dgs.json"
+    shutil.copytree(folder, tmp_path / "few/entries" / folder.name)
+    shutil.copy(COMMITTED / "LEDGER", tmp_path / "few")
+    return tmp_path / "few"
+
+
+def test_entries_of_ones_own_stand_among_the_published_ones(few: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A copy of the published entries without one method, and with another record of a second."""
+    (removed,) = few.glob("entries/*/tfi+4dgs.json")
+    published = read_json(removed, "an entry")["record"]["mean"]["psnr"]
+    removed.unlink()
+    path = removed.with_name("tfp+4dgs.json")
     entry = read_json(path, "an entry") | {"submitted": "2031-01-01T00:00:00Z"}
     write_json(path, entry)
-    add_line(own, sha256_json(entry), path.relative_to(own).as_posix())
-    assert main(["leaderboard", "--track", "quick-start", "--leaderboard", str(own)]) == 0
+    add_line(few, sha256_json(entry), path.relative_to(few).as_posix())
+    assert main(["leaderboard", "--track", "quick-start", "--leaderboard", str(few)]) == 0
     names = [line.split()[1:3] for line in capsys.readouterr().out.splitlines()[2:]]
-    published = read_json(folder / "tfi+4dgs.json", "an entry")["record"]["mean"]["psnr"]
     assert ["tfp+4dgs", "(published)"] in names and ["tfi+4dgs", f"{published:.2f}"] in names
     assert sum(name[:1] == ["tfp+4dgs"] for name in names) == 2 and sum(n[:1] == ["spike4dgs-x"] for n in names) == 1
 
@@ -85,11 +93,14 @@ def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_run_without_its_scenes_gives_a_page_without_images(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    finished: Path, few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
+    """Beside published entries, few for the sake of time."""
+    monkeypatch.setattr(rows, "SHIPPED", few)
+    assert submit(finished / "out/results/rough.json", leaderboard=tmp_path / "own") == 0
     shutil.copytree(finished / "out", tmp_path / "first")
     given = ["--out", str(tmp_path / "page"), "--runs", str(tmp_path / "first"), "--data", str(tmp_path)]
+    given += ["--leaderboard", str(tmp_path / "own")]
     assert main(["leaderboard", "build", *given]) == 0
     out = capsys.readouterr().out
     assert "left out: no images of pattern-0" in out and str(tmp_path / "page/index.html") in out

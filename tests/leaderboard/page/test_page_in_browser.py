@@ -24,7 +24,7 @@ from spike4dgs.leaderboard.page.content import board_content
 from spike4dgs.leaderboard.page.intervals import compare
 from spike4dgs.leaderboard.page.rows import Board, find_board, gather, titles
 from spike4dgs.leaderboard.page.scores import image_scores
-from spike4dgs.leaderboard.page.site import write_site
+from spike4dgs.leaderboard.page.site import Site, write_site
 from spike4dgs.leaderboard.submit import submit_all
 
 COMMITTED = Path(__file__).resolve().parents[3] / "leaderboard"
@@ -107,14 +107,18 @@ def shown(one_browser: Page) -> Iterator[Page]:
 
 
 @pytest.fixture(scope="module")
-def folder(finished: Path, data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(finished: Path, data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Site]:
     """The committed entries, a run with images, and boards made for the tests, as one page."""
     out = tmp_path_factory.mktemp("page") / "page"
     boards, refused = gather(COMMITTED, (finished / "out",))
     sheets = sheets_board(finished, tmp_path_factory.mktemp("sheets") / "board")
     made = [seeds_board(), sensors_board(), hostile_board(), labels_board(), flags_board(), sheets]
-    write_site(out, [*boards, *made], [*refused, {"entry": HOSTILE, "reason": HOSTILE}], data)
-    return out
+    return out, write_site(out, [*boards, *made], [*refused, {"entry": HOSTILE, "reason": HOSTILE}], data)
+
+
+@pytest.fixture(scope="module")
+def folder(written: tuple[Path, Site]) -> Path:
+    return written[0]
 
 
 @pytest.fixture
@@ -168,6 +172,16 @@ def count_of(committed: list[Board], **parts: str) -> tuple[int, int]:
     rows = board_content(find_board(committed, "ideal"), "ideal")["rows"]
     found = sum(all(row["parts"].get(k) == v for k, v in parts.items()) for row in rows)
     return found, len(rows) - found
+
+
+def test_the_committed_entries_fit_the_first_view(written: tuple[Path, Site]) -> None:
+    """And others beside them."""
+    folder, site = written
+    assert site.first_view_bytes < 1_500_000 and not site.left_out
+    html = (folder / "index.html").read_text()
+    linked = re.findall(r'(?:src|href)="([^"#]+)"', html)
+    assert all((folder / name).is_file() for name in linked if not name.startswith("data:,"))
+    assert not re.search(r"https?:", html.replace("http-equiv", ""))
 
 
 def test_it_opens_from_the_disk_and_ranks_as_the_board_does(page: Page) -> None:
@@ -535,12 +549,12 @@ def test_keys_labels_and_a_narrow_screen(page: Page) -> None:
         assert page.value("document.documentElement.scrollWidth") <= width, "only the table scrolls sideways"
 
 
-def test_a_thousand_rows_of_45_scenes_are_filtered_and_drawn_in_part(shown: Page, tmp_path: Path) -> None:
-    write_site(tmp_path / "page", [large_board(1000, 45, 60)])
+def test_many_rows_are_filtered_and_drawn_in_part(shown: Page, tmp_path: Path) -> None:
+    write_site(tmp_path / "page", [large_board(400, 3, 20)])
     shown.show((tmp_path / "page/index.html").as_uri(), "Boolean(document.body?.dataset.whole)", 1400, 900)
     go(shown, "motion=static&images=tfi")
     # a third of the rows, every second of them
-    assert text_of(shown, "count").startswith("167 rows, the first 50 drawn; 833 rows hidden")
+    assert text_of(shown, "count").startswith("67 rows, the first 50 drawn; 333 rows hidden")
 
 
 def test_a_screen_in_the_dark(page: Page) -> None:

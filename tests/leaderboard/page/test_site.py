@@ -24,15 +24,6 @@ def small() -> list[site.Board]:
     return [board("b", [row(n, {"s": cell({"psnr": np.arange(3) + i})}) for i, n in enumerate(("one", "two"))])]
 
 
-def test_the_committed_entries_fit_the_first_view(committed: list[site.Board], tmp_path: Path) -> None:
-    written = write_site(tmp_path / "page", committed)
-    assert written.first_view_bytes < 1_500_000 and not written.left_out
-    html = (tmp_path / "page/index.html").read_text()
-    linked = re.findall(r'(?:src|href)="([^"#]+)"', html)
-    assert all((tmp_path / "page" / name).is_file() for name in linked if not name.startswith("data:,"))
-    assert not re.search(r"https?:", html.replace("http-equiv", ""))
-
-
 def test_a_page_is_replaced_and_equal_boards_give_equal_bytes(tmp_path: Path) -> None:
     out = tmp_path / "page"
     write_site(out, [*small(), *small()])

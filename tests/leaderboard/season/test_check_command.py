@@ -101,11 +101,11 @@ def test_a_scene_made_again_from_its_seed_is_the_committed_one(
     over: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Any
 ) -> None:
     render_fakes(monkeypatch)
-    for seed in read_opening(over.public / OPENING_NAME).scenes:
-        settings = SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=seed.rendering)
-        make_dataset([settings.job(seed.world)], tmp_path / "again")
-    assert checked(over, scenes=tmp_path / "again") == 0
-    assert said().count("is the scene committed to") == 2
+    seed = read_opening(over.public / OPENING_NAME).scenes[0]
+    settings = SceneSettings(seed.profile, int(seed.seed), seed.variant, rendering=seed.rendering)
+    make_dataset([settings.job(seed.world)], tmp_path / "again")
+    assert checked(over, scenes=tmp_path / "again", predictions=None) == 0
+    assert said().count("is the scene committed to") == 1
     make_dataset([SceneSettings("tiny", int(seed.seed) ^ 1, 9003).job("car")], tmp_path / "wrong")
     assert checked(over, scenes=tmp_path / "wrong", predictions=None) == 2
     assert "render other bytes" in said()

@@ -115,10 +115,11 @@ def test_a_method_gets_the_training_part_alone(once: Made, tmp_path: Path) -> No
     assert [r for r, _ in seen] == [s.training_revision for s in once.season.scenes]
 
 
+@pytest.mark.usefixtures("installed")
 def test_installed_methods_are_run_and_scored(made: Made) -> None:
-    assert score(NUMBER, secret=made.secret, seasons=made.seasons, methods=("nearest-view",), device="cpu") == 0
+    assert score(NUMBER, secret=made.secret, seasons=made.seasons, methods=("rough",), device="cpu") == 0
     (result,) = read_results(made.seasons, made.season)
-    assert (result.name, result.submitted_as) == ("nearest-view", "method")
+    assert (result.name, result.submitted_as) == ("rough", "method")
     assert {cell["budget"] for cell in result.record["scenes"].values()} == {0.02}
 
 
@@ -156,9 +157,10 @@ def test_nothing_to_score_is_an_error_and_hidden_streams_take_methods_only(made:
         made.score("counts")
 
 
+@pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize("folder", [scene_folder, training_folder])
 def test_another_scene_than_the_committed_one_is_not_scored(folder: Any, made: Made) -> None:
     key = "revision" if folder is scene_folder else "training_revision"
     edit_json(made.public / "season.json", lambda season: season["scenes"][1].update({key: "0" * 64}))
     with pytest.raises(UserError, match=r"turntable-9003-tiny: expected revision 0000.*, as committed"):
-        score(NUMBER, secret=made.secret, seasons=made.seasons, methods=("nearest-view",), device="cpu")
+        score(NUMBER, secret=made.secret, seasons=made.seasons, methods=("rough",), device="cpu")
