@@ -164,7 +164,7 @@ def test_a_score_that_the_method_does_not_reach_is_refused_whatever_second_fits_
     record = json.loads((done / "out/results/tfp+4dgs.json").read_text())
     work = done / "board/.refit" / sha256_json([record["method"], record["dataset"]])[:16]
     for number, scene in enumerate(("pattern-0", "pattern-1")):
-        run(work / scene, [done / f"s{number}"], Darker("tfp+4dgs"))
+        run(work / scene, [done / f"s{number}"], Darker("tfp+4dgs"), metrics=("psnr",))
         sent = work / scene / "predictions/tfp+4dgs" / scene
         key = json.loads((sent / "prediction.json").read_text())["key"]
         shutil.copytree(done / "out/predictions/tfp+4dgs" / scene, sent, dirs_exist_ok=True)

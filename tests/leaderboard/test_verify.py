@@ -301,16 +301,19 @@ def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.Mon
 def test_a_label_that_a_second_fit_does_not_bear_out_is_found(
     done: Path, installed: dict[str, Any], said: Any, problems: Any
 ) -> None:
-    path = enter(done)
-    claimed = {scene: cell["metrics"]["psnr"] for scene, cell in read(path)["record"]["scenes"].items()}
-    edit_with_ledger(path, refitted(claimed))
+    """Of one scene, as each fit takes a process."""
+    run(done / "one", [done / "s1"], CountMethod("tfp+4dgs"), metrics=("psnr",))
+    result, files = done / "one/results/tfp+4dgs.json", {"scenes": (done / "s1",), "leaderboard": done / "board"}
+    assert submit(result, predictions=done / "one/predictions/tfp+4dgs", **files) == 0
+    edit_with_ledger(entry_of(done), refitted({"pattern-1": json.loads(result.read_text())["mean"]["psnr"]}))
     enter(done, "bad", verified=False)  # writes the boards anew
+    given = {"predictions": done / "one/predictions", "scenes": (done / "s1",)}
     said()
-    assert verify_leaderboard(done / "board", **files_of(done)) == 0
+    assert verify_leaderboard(done / "board", **given) == 0
     assert "1 scored again, 1 labelled re-fitted and not fitted again (--refit), no problems" in said()
-    assert verify_leaderboard(done / "board", **files_of(done), refit=True) == 0
+    assert verify_leaderboard(done / "board", **given, refit=True) == 0
     installed["tfp+4dgs"] = Darker("tfp+4dgs")
-    (line,) = problems(done, **files_of(done), refit=True)
+    (line,) = problems(done, **given, refit=True)
     assert "expected a second fit within 0.3 dB of the claimed" in line
 
 
