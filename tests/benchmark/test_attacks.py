@@ -1,5 +1,6 @@
 """Files made to do harm, one test for each way: refused in one line, before anything is computed or written."""
 
+import itertools
 import json
 import shutil
 import struct
@@ -104,8 +105,14 @@ CELL = "scenes/pattern-0/"
 IMAGE = "per_image/cam_03|000020/psnr"
 
 
-@pytest.mark.parametrize("value", [HUGE, "-1e400", "1e308", "-1e308", "1e13", "Infinity", "NaN", '"1"', "true", "[1]"])
-@pytest.mark.parametrize("field", ["fit_seconds", "render_fps", "gain_aligned", "metrics/psnr", IMAGE])
+FIELDS = ("fit_seconds", "render_fps", "gain_aligned", "metrics/psnr", IMAGE)
+NO_NUMBERS = (HUGE, "-1e400", "Infinity", "NaN", "true", "[1]")  # of any field: the text of a number is no number
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [*itertools.product(FIELDS, ("1e308", "-1e308", "1e13", '"1"')), *itertools.product(FIELDS[-1:], NO_NUMBERS)],
+)
 def test_numbers_of_records(scored: Path, tmp_path: Path, field: str, value: str) -> None:
     record = json.loads((scored / "record.json").read_text())
     cell = record["scenes"]["pattern-0"]
@@ -128,10 +135,16 @@ def test_numbers_of_records(scored: Path, tmp_path: Path, field: str, value: str
         (CELL + "fit_seconds", -1),
     ],
 )
-def test_names_and_facts_of_records(scored: Path, tmp_path: Path, path: str, value: Any) -> None:
+def test_names_and_facts_of_records(scored: Path, path: str, value: Any) -> None:
     record = json.loads((scored / "record.json").read_text())
     put(record, path, value)
     refused(lambda: check_record(record, "here"), "expected a valid spike4dgs-result/1")
+
+
+@pytest.mark.parametrize("path", ["dataset/name", "dataset/split", "method/name"])
+def test_a_record_whose_name_leads_elsewhere_is_not_submitted(scored: Path, tmp_path: Path, path: str) -> None:
+    record = json.loads((scored / "record.json").read_text())
+    put(record, path, "../../outside")
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "record.json").write_text(json.dumps(record))
     refused(lambda: submit(tmp_path / "in/record.json", leaderboard=tmp_path / "in/board"), "record.json")

@@ -56,20 +56,17 @@ def compiled(folder: Path) -> list[Path]:
 
 
 def test_nothing_lands_beside_the_sources_and_two_installs_share_nothing(install: Path, tmp_path: Path) -> None:
+    """The second also finds no folder to write to at first, and keeps nothing then."""
     second = shutil.copytree(install, tmp_path / "second")
     cache = tmp_path / "cache"
     call_in(install, XDG_CACHE_HOME=str(cache))
     first = compiled(cache / "spike4dgs/numba")
+    (tmp_path / "file").touch()
+    call_in(second, XDG_CACHE_HOME=str(tmp_path / "file"))
+    assert first and compiled(tmp_path) == first
     call_in(second, XDG_CACHE_HOME=str(cache))
     both = compiled(cache / "spike4dgs/numba")
-    assert first and len(both) == 2 * len(first)
-    assert not compiled(install) and not compiled(second)
-
-
-def test_numbas_variable_goes_before(install: Path, tmp_path: Path) -> None:
-    call_in(install, XDG_CACHE_HOME=str(tmp_path / "cache"), NUMBA_CACHE_DIR=str(tmp_path / "chosen"))
-    assert compiled(tmp_path / "chosen") and not (tmp_path / "cache/spike4dgs/numba").exists()
-    assert not compiled(install)
+    assert len(both) == 2 * len(first) and compiled(tmp_path) == both
 
 
 KERNEL = """
@@ -98,6 +95,13 @@ def kernel_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     (tmp_path / "kernel_of_parts.py").write_text(KERNEL)
     return tmp_path
+
+
+def test_numbas_variable_goes_before(kernel_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """numba takes its setting from NUMBA_CACHE_DIR when it is imported."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(kernel_folder / "users"))
+    changed_parts(kernel_folder, [PARTS])
+    assert compiled(kernel_folder) == compiled(kernel_folder / "cache") != []
 
 
 def changed_parts(folder: Path, texts: list[str]) -> tuple[list[int], list[int]]:
@@ -162,12 +166,6 @@ def test_kernels_depend_on_their_vectors_file(kernel: Any, tmp_path: Path, monke
     changed.write_text(Path(vector_ir.__file__).read_text() + "# changed")
     monkeypatch.setattr(vector_ir, "__file__", str(changed))
     assert parts_digest(kernel._function) != before
-
-
-def test_without_a_folder_to_write_to_nothing_is_kept(install: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    call_in(install, XDG_CACHE_HOME=str(tmp_path / "file"))
-    assert not compiled(tmp_path)
 
 
 def test_other_packages_keep_numbas_own_folder() -> None:

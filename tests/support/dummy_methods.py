@@ -145,4 +145,5 @@ def run(out: Path, scenes: list[Path], *methods: Any, **settings: Any) -> list[d
 if __name__ == "__main__":  # a run that kills itself: OUT SCENE METHOD_THAT_DIES STEP
     out, scene, victim, step = sys.argv[1:]
     names = ("first", "second")
-    run(Path(out), [Path(scene)], *(CountMethod(n, die_at=int(step) if n == victim else None) for n in names), seed=3)
+    methods = (CountMethod(n, die_at=int(step) if n == victim else None) for n in names)
+    run(Path(out), [Path(scene)], *methods, seed=3, metrics=("psnr",))

@@ -58,7 +58,6 @@ def test_the_limits_of_the_host(copy: Path, monkeypatch: pytest.MonkeyPatch) -> 
         b"# No card\n",
         b"---\nlicense: [\n---\n",
         b"---\ntags: []\n---\n# No licence\n",
-        b"---\nlicense: " + b"[" * 20_000 + b"\n---\n",
         b"---\nlicense: &a [mit]\ntags: [*a, *a]\n---\n",  # a few such lines stand for more than memory holds
         b"---\nlicense: \xff\n---\n",
     ],

@@ -107,7 +107,9 @@ def test_nothing_is_cut_off_and_no_text_lies_on_another(figure: Figure) -> None:
                 assert not axes.bbox.overlaps(box) or box.x0 >= axes.bbox.x1 or box.x1 <= axes.bbox.x0, text
 
 
-def test_the_pdf_has_text_as_text_inside_its_page(results: Results, tmp_path: Path) -> None:
+def test_the_pdf_has_text_as_text_inside_its_page(tmp_path: Path) -> None:
+    method = list(NOISE)[1]
+    results = write_results(tmp_path, {method: NOISE[method]}, {"bad": REASON})
     write_sheet(tmp_path / "sheet.png", results.scene, results.folders, results.records)
     page = PdfReader(tmp_path / "sheet.pdf").pages[0]
     found: list[tuple[str, float, float]] = []
@@ -118,7 +120,7 @@ def test_the_pdf_has_text_as_text_inside_its_page(results: Results, tmp_path: Pa
 
     page.extract_text(visitor_text=visit)
     together = "".join(text for text, _, _ in found).replace("\n", "")
-    for name in (*NOISE, "ground truth", "bad", "failed: ValueError: no luck", "PSNR 33.98 dB, moving 32.98 dB"):
+    for name in (method, "ground truth", "bad", "failed: ValueError: no luck", "PSNR 33.98 dB, moving 32.98 dB"):
         assert name in together
     assert all(0 <= x <= page.mediabox.width and 0 <= y <= page.mediabox.height for _, x, y in found)
     embedded = {i.image.size for i in page.images if i.image}
@@ -129,12 +131,12 @@ def test_the_pdf_has_text_as_text_inside_its_page(results: Results, tmp_path: Pa
 
 
 def test_a_sheet_of_many_methods_grows(tmp_path: Path) -> None:
-    many = write_results(tmp_path, {f"method+{i:02d}": 0.02 for i in range(14)})
+    many = write_results(tmp_path, {f"method+{i:02d}": 0.02 for i in range(8)})
     figure = make_sheet(make_panels(many.scene, many.folders, many.records))
     shown = {t.get_text() for t in figure.texts}
-    assert all(f"method+{i:02d}" in shown for i in range(14))
+    assert all(f"method+{i:02d}" in shown for i in range(8))
     rows = sorted({round(a.bbox.y0) for a in figure.axes})
-    assert len(rows) == 15 and min(np.diff(rows)) > 150, "each as large as in a small sheet"
+    assert len(rows) == 9 and min(np.diff(rows)) > 150, "each as large as in a small sheet"
     test_nothing_is_cut_off_and_no_text_lies_on_another(figure)
 
 

@@ -243,6 +243,7 @@ def test_splits_never_mix_in_a_leaderboard(scene: Path, tmp_path: Path, capsys: 
         assert row["entries"] == [f"local/pattern-0@{b['revision'][:12]}/counts.json"]
 
 
+@pytest.mark.usefixtures("no_images")
 def test_run_benchmark_keeps_the_splits_apart(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -253,4 +254,4 @@ def test_run_benchmark_keeps_the_splits_apart(
     records = {p.parent.parent.name: json.loads(p.read_text()) for p in (tmp_path / "out").rglob("results/counts.json")}
     assert {name: r["dataset"]["split"] for name, r in records.items()} == {"out": "center", "corner": "corner"}
     assert "Results, split corner" in capsys.readouterr().out
-    assert (tmp_path / "out/corner/sheet_pattern-0.png").is_file()
+    assert (tmp_path / "out/corner/table.md").is_file()

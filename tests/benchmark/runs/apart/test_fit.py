@@ -75,8 +75,7 @@ def test_what_a_fit_sees_has_neither_the_held_out_camera_nor_how_the_scene_was_m
     monkeypatch.setenv("SPIKE4DGS_RELEASE", str(tmp_path))
     monkeypatch.chdir(made_scene.parent)
     seen, scene = tmp_path / "seen.json", open_scene(made_scene)
-    cell = cell_of(run(tmp_path / "out", [made_scene], LooksAround(seen), **APART))
-    assert cell["status"] == "ok"
+    assert cell_of(run(tmp_path / "out", [made_scene], LooksAround(seen), **APART))["status"] == "ok"
     found = json.loads(seen.read_text())
     wanted = ["README.md", *(f"{name}.json" for name in ("croissant", "manifest", "scene", "targets"))]
     wanted += [f"sparse/0/{name}.bin" for name in ("cameras", "frames", "images", "points3D", "rigs")]
@@ -90,8 +89,7 @@ def test_what_a_fit_sees_has_neither_the_held_out_camera_nor_how_the_scene_was_m
     assert json.loads(found["texts"]["scene.json"])["source"] == {"kind": "mitsuba"}
     assert str(made_scene.parent) not in {found["environment"].get(name) for name in ("PWD", "SPIKE4DGS_RELEASE")}
     assert found["scene"][:2] == ["scene", scene.revision]
-    training = scene.training.cameras
-    exact = [[c.id, *c.K.ravel().tolist(), *c.R.ravel().tolist(), *c.t.tolist()] for c in training]
+    exact = [[c.id, *c.K.ravel().tolist(), *c.R.ravel().tolist(), *c.t.tolist()] for c in scene.training.cameras]
     assert found["cameras"] == exact, "poses to the last bit"
     captured = capfd.readouterr()
     assert "printed to standard output" in captured.err and "printed" not in captured.out
@@ -138,8 +136,7 @@ def test_other_splits_hold_out_their_own_cameras(tmp_path: Path) -> None:
 
 
 def test_refined_views_are_sent_after_the_images_are_taken(small_scene: Path, tmp_path: Path) -> None:
-    method = Refines(tmp_path / "seen.json")
-    plain, refined = run(tmp_path / "out", [small_scene], method, seed=3, **APART)
+    plain, refined = run(tmp_path / "out", [small_scene], Refines(tmp_path / "seen.json"), seed=3, **APART)
     seen = json.loads((tmp_path / "seen.json").read_text())
     assert seen["before"] == 3 and seen["image"] > 0 and 0 < seen["background"] < 40 * 24
     assert [plain["method"]["name"], refined["method"]["name"]] == ["refines", "refines.refined"]
