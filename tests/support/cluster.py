@@ -17,7 +17,7 @@ def dask_cluster(
 ) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """Yield the address of a scheduler that has its workers, and its process. `settings` are of DASK_DISTRIBUTED.
 
-    Without a nanny a worker that dies is not started again, and there may be only one.
+    Without nannies a worker that dies is not started again.
     """
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
@@ -26,13 +26,14 @@ def dask_cluster(
     settings |= {"WORKER__PROFILE__ENABLED": "False"}  # it looks at every thread a hundred times a second
     env = {**os.environ, "PYTHONPATH": path, **{f"DASK_DISTRIBUTED__{k}": v for k, v in settings.items()}}
     scheduler = ["scheduler", "--host", address, "--no-dashboard", "--no-jupyter"]
-    worker = ["worker", address, "--nworkers", str(workers), "--nthreads", "1", "--no-dashboard"]
-    worker += [] if nanny else ["--no-nanny"]
-    worker += ["--memory-limit", "0", "--local-directory", str(folder)]
-    logs = [open(folder / f"{name}.log", "wb") for name in ("scheduler", "worker")]
+    worker = ["worker", address, "--nthreads", "1", "--no-dashboard", "--memory-limit", "0"]
+    worker += ["--local-directory", str(folder)]
+    all_workers = [[*worker, "--nworkers", str(workers)]] if nanny else [[*worker, "--no-nanny"]] * workers
+    names = ("scheduler", *(f"worker-{k}" for k in range(len(all_workers))))
+    logs = [open(folder / f"{name}.log", "wb") for name in names]
     started = [
         subprocess.Popen([sys.executable, "-m", "dask", *arguments], env=env, stdout=log, stderr=log)
-        for arguments, log in zip((scheduler, worker), logs, strict=True)
+        for arguments, log in zip((scheduler, *all_workers), logs, strict=True)
     ]
     try:
         wait_for(lambda: (folder / "scheduler.log").read_text().count("Register worker") >= workers)

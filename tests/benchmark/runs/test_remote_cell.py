@@ -40,8 +40,7 @@ PSNR: dict[str, Any] = {"metrics": ("psnr",)}
 
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Of two workers; it gives a cell up that killed two."""
-    with dask_cluster(tmp_path_factory.mktemp("dask"), 2, SCHEDULER__ALLOWED_FAILURES="1") as (address, _):
+    with dask_cluster(tmp_path_factory.mktemp("dask"), 2) as (address, _):
         yield address
 
 
@@ -75,16 +74,6 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path, scheduler: str) -> None:
     assert not list((tmp_path / "spread").glob("**/work/*"))
 
 
-def test_a_fit_that_kills_one_worker_after_another_fails_its_cell(
-    tmp_path: Path, small_scene: Path, scheduler: str
-) -> None:
-    for k in range(2):
-        (tmp_path / f"bullet-{k}").touch()
-    (killer,) = run(tmp_path / "out", [small_scene], WorkerKiller("killer", tmp_path), scheduler=scheduler, **PSNR)
-    cell = killer["scenes"]["pattern-0"]
-    assert cell["status"] == "failed" and "its workers died one after another" in cell["error"]
-
-
 def test_a_killed_caller_loses_nothing_that_came_back(tmp_path: Path, small_scene: Path, scheduler: str) -> None:
     quick, waiting = CountMethod("quick"), WaitingMethod("waiting", tmp_path)
     caller = subprocess.Popen(
@@ -107,8 +96,12 @@ def test_a_killed_caller_loses_nothing_that_came_back(tmp_path: Path, small_scen
 
 def test_a_lost_scheduler_is_one_error_and_what_came_back_is_kept(tmp_path: Path, small_scene: Path) -> None:
     quick, waiting = CountMethod("quick"), WaitingMethod("waiting", tmp_path)
+    (tmp_path / "bullet").touch()
     (tmp_path / "dask").mkdir()
-    with dask_cluster(tmp_path / "dask", 1, nanny=False) as (address, process):
+    with dask_cluster(tmp_path / "dask", 2, nanny=False, SCHEDULER__ALLOWED_FAILURES="0") as (address, process):
+        (killer,) = run(tmp_path / "out", [small_scene], WorkerKiller("killer", tmp_path), scheduler=address, **PSNR)
+        cell = killer["scenes"]["pattern-0"]
+        assert cell["status"] == "failed" and "its workers died one after another" in cell["error"]
 
         def lose() -> None:
             kept = tmp_path / "out/results/quick.json"
