@@ -11,11 +11,12 @@ from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import Sim3
-from spike4dgs.benchmark.scene.training_bursts import open_bursts, open_folder
+from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.studies.poses import dark, points
 from spike4dgs.studies.poses.dark import ESTIMATORS, dark_poses, errors_of, see
 
-TRUE = ToyWorld(width=96, height=61, seed=1).training.cameras
+WORLD = ToyWorld(width=96, height=61, seed=1)
+TRUE = tuple(c for c in WORLD.cameras if c is not WORLD.held_out)
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +98,8 @@ def test_errors_are_relative_to_the_distance_and_ranked_by_sureness() -> None:
     assert points.errors_of((inverse, np.array([[0.1, 0.5, 0.9, 0.0]], np.float32)), true)["rank"] == -1
 
 
-def test_both_finders_see_a_bright_world(tmp_path: Path) -> None:
-    file = open_bursts(write_toy_shard(tmp_path, 12, width=96, height=61, resting=1))
+def test_both_finders_see_a_bright_world(shards: Path) -> None:
+    (file,) = (f for f in open_folder(shards) if f.facts.hidden)
     burst = file.read(2)
     sight = see(burst, file, 1.0, 401, np.random.default_rng(0))
     for find in points.FINDERS.values():
@@ -107,12 +108,10 @@ def test_both_finders_see_a_bright_world(tmp_path: Path) -> None:
         assert points.errors_of((inverse, sure), burst.depth[0].astype(np.float64))["error"] < 0.05
 
 
-def test_the_table_of_points_has_a_line_for_each_condition(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for variant in (12, 13):  # one hidden, one to train on
-        write_toy_shard(tmp_path, variant, width=96, height=61, resting=2)
+def test_the_table_of_points_has_a_line_for_each_condition(shards: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(points, "LIGHTS", (1.0, 1 / 4))
     monkeypatch.setattr(points, "TICKS", (41,))
-    assert points.dark_points(tmp_path, out=tmp_path / "out") == 0
+    assert points.dark_points(shards, out=tmp_path / "out") == 0
     rows = json.loads((tmp_path / "out" / "points.json").read_text())["rows"]
     assert [(row["world"], row["light"], row["points"]) for row in rows] == [
         ("toy-12", light, name) for light in (1.0, 1 / 4) for name in points.FINDERS

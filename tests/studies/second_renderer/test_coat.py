@@ -23,7 +23,7 @@ def mitsuba_matte(alpha: float, view: float, light: float) -> float:
     return float(np.ravel(np.array(value))[0]) * np.pi / light / ALBEDO
 
 
-@pytest.mark.parametrize("alpha", [0.1, 0.25, 0.4])
+@pytest.mark.parametrize("alpha", [0.1, 0.4])
 def test_the_matte_lobe_is_mitsubas(alpha):
     found = coat(alpha)
     cosines = np.linspace(0, 1, len(found.through))
