@@ -137,13 +137,28 @@ def test_an_interruption_is_exit_130(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert capsys.readouterr().err == "interrupted\n"
 
 
-@pytest.mark.parametrize("command", ["methods", "--help"])
-def test_a_reader_that_goes_away_is_no_traceback(command: str) -> None:
+# A command that prints as the others do, and imports no method.
+SHOWS = """
+import sys
+from spike4dgs.benchmark.reports.console import make_console
+from spike4dgs.cli import Command, dispatch, main
+
+def show() -> int:
+    "Show."
+    make_console().print("shown")
+    return 0
+
+dispatch.COMMANDS = {"show": Command("__main__:show", "show", "show")}
+sys.exit(main(["show"]))
+"""
+
+
+@pytest.mark.parametrize("program", [["-m", "spike4dgs.cli", "--help"], ["-c", SHOWS]], ids=["print", "console"])
+def test_a_reader_that_goes_away_is_no_traceback(program: list[str]) -> None:
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as closed:
-        program = [sys.executable, "-m", "spike4dgs.cli", command]
-        done = subprocess.run(program, stdout=closed, stderr=subprocess.PIPE, text=True)
+        done = subprocess.run([sys.executable, *program], stdout=closed, stderr=subprocess.PIPE, text=True)
     assert done.returncode in (1, 141) and not done.stderr  # 1 where rich notices first
 
 
