@@ -2,6 +2,7 @@
 
 import csv
 import pickle
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from changes import edit_json
 from toy_world import GAIN, ToyWorld
 
 from spike4dgs.baselines.recipes import INITIALIZATIONS, PARTS
@@ -17,6 +19,7 @@ from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.method import Budget, FitRequest, find_methods
 from spike4dgs.benchmark.runs.record import read_record
 from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.cli import main
 from spike4dgs.method.gaussians.parameters import from_points
@@ -210,7 +213,10 @@ def test_what_is_no_recipe_of_the_trainer_with_given_poses_has_no_ladder(root: P
 
 @pytest.mark.slow
 def test_the_command_climbs_the_ladder_of_a_made_scene(tiny_data: Path, tmp_path: Path, capsys) -> None:
-    scene, out = tiny_data / "car-0-tiny", tmp_path / "out"
+    scene, out = Path(shutil.copytree(tiny_data / "car-0-tiny", tmp_path / "car-0-tiny")), tmp_path / "out"
+    # The background of the truth is rendered with as few samples as the rest: no image is looked at.
+    edit_json(scene / "scene.json", lambda meta: meta["source"]["sampling"].update(background_spp=16))
+    write_manifest(scene)
     options = ["--samples", "16", "--budget", "0.005", "--device", "cpu", "--out", str(out)]
     assert main(["report", "oracle-ladder", str(scene), *options, "--metrics", "psnr"]) == 0
     assert "where things move" in " ".join(capsys.readouterr().out.split()) and not (out / "leaderboard").exists()
