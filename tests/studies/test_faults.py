@@ -3,11 +3,13 @@
 import csv
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from changes import edit_json, files_in
+from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 from small_scenes import HEIGHT, WIDTH
 
@@ -17,6 +19,7 @@ from spike4dgs.benchmark.scene.images import write_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli import main
+from spike4dgs.method.recordings import fit as fit_module
 from spike4dgs.studies import faults as fault_table
 from spike4dgs.studies.faults import CASES, Case, Outcome
 
@@ -28,6 +31,16 @@ def test_cases_have_folders_of_their_own_and_begin_without_a_fault() -> None:
 
 
 COMMAND = ["--methods", "tfp+static", "--budget", "0.01"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _brief() -> Iterator[None]:
+    """Ten frames of video, not 300, and a gray pixel for the sheet: each takes longer than the rest of a fit."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("FPS", "SLOW_FPS"):
+            patch.setattr(fit_module, name, 1.0)
+        patch.setattr(fit_module, "write_sheet", lambda path, *_: Image.new("L", (1, 1)).save(path))
+        yield
 
 
 @pytest.fixture(scope="module")

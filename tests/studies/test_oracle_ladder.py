@@ -49,9 +49,10 @@ def go(scenes: list[Path], out: Path, *rungs: CountMethod, **settings: object) -
     return records
 
 
-@pytest.fixture
-def scenes(tmp_path: Path) -> list[Path]:
-    return [write_small_scene(tmp_path / f"s{i}", seed=i) for i in range(2)]
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("scenes")
+    return [write_small_scene(folder / f"s{i}", seed=i) for i in range(2)]
 
 
 def test_the_table_has_what_the_records_have_and_the_difference_to_the_first_rung(scenes: list[Path], tmp_path) -> None:
