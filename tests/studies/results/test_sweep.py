@@ -1,6 +1,7 @@
 """The sweep: a killed one goes on where it was, failed cells are tried again, times count in quiet passes alone."""
 
 import io
+import shutil
 import signal
 import subprocess
 import sys
@@ -58,13 +59,15 @@ def swept(
 
 @pytest.fixture
 def fits_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits in this process: to start one for each takes longer than the fit."""
+    """Fits in this process, one metric, no published times for the display: each takes longer than the fit."""
     monkeypatch.setattr("spike4dgs.studies.results.sweep.Apart", lambda: None)
+    monkeypatch.setattr("spike4dgs.studies.results.sweep.METRICS", ("psnr",))
+    monkeypatch.setattr("spike4dgs.studies.results.sweep.typical_fit_seconds", dict)
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    write_small_scene(tmp_path / "pattern-0")
+def folder(one_small_scene: Path, tmp_path: Path) -> Path:
+    shutil.copytree(one_small_scene, tmp_path / "pattern-0")
     return tmp_path
 
 
@@ -91,7 +94,8 @@ swept(folder, cells("quick", "waits"), {"quick": CountMethod("quick"), "waits": 
 """
 
 
-@pytest.mark.slow  # three runs, each with processes that fit
+@pytest.mark.slow  # the run that is killed has processes that fit
+@pytest.mark.usefixtures("fits_here")
 def test_a_killed_sweep_goes_on_where_it_was_and_repeats_nothing(folder: Path) -> None:
     here, support = Path(__file__).parent, Path(dummy_methods.__file__).parent
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(support), str(here), str(folder)])
@@ -130,6 +134,7 @@ def test_a_record_says_what_was_measured_of_what(folder: Path) -> None:
     assert len(predictions) == 3 and predictions[0].is_relative_to(folder / "out" / record["code"])
 
 
+@pytest.mark.usefixtures("fits_here")
 def test_a_refined_row_is_its_method_scored_at_the_refined_held_out_poses(folder: Path) -> None:
     """The method renders brighter images at refined poses."""
     methods = {"refines": Refines(folder / "seen.json")}
@@ -141,6 +146,7 @@ def test_a_refined_row_is_its_method_scored_at_the_refined_held_out_poses(folder
     assert refined["metrics"]["psnr"] == pytest.approx(brighter["mean"]["psnr"], rel=1e-5)
 
 
+@pytest.mark.usefixtures("fits_here")
 def test_a_failed_cell_says_why_and_is_tried_again(folder: Path) -> None:
     planned = cells("bad", "weightless")
     methods = {"bad": FailingMethod("bad", ValueError("no luck")), "weightless": WeightlessMethod("weightless")}
