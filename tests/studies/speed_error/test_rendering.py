@@ -1,5 +1,8 @@
+from dataclasses import replace
+
 import pytest
 
+from spike4dgs.generators.profiles import PROFILES
 from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
 from spike4dgs.studies.kit.measurement import Request
 from spike4dgs.studies.speed_error import rendering
@@ -10,8 +13,9 @@ REQUEST = Request("tiny", 0, lambda: pytest.fail("no scene is needed"))
 
 @pytest.fixture(autouse=True)
 def _one_world(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the size whose times are of one image each."""
+    """In the size whose times are of one image each; a quarter of the background's samples give the same errors."""
     monkeypatch.setitem(rendering.OF_SIZE, "tiny", ("car",))
+    monkeypatch.setattr(rendering, "PROFILES", {"tiny": replace(PROFILES["tiny"], background_spp=64)})
 
 
 @pytest.mark.slow
