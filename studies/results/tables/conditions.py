@@ -54,7 +54,7 @@ class Condition:
         suffix = tyro.cli(PhysicsOptions, args=self.physics.split()).physics().suffix
         return tuple(f"{world}-small{'' if self.ms is None else f'-{self.ms}ms'}{suffix}" for world in self.worlds)
 
-    @property
+    @cached_property
     def absent(self) -> Condition:
         """No condition, in the same worlds."""
         return replace(NONE, worlds=self.worlds)
