@@ -27,10 +27,10 @@ def toy_burst(world: ToyWorld, t: float, count: int = 3) -> Burst:
 
 
 def write_toy_shard(
-    folder: Path, variant: int, *, width: int = 32, height: int = 24, instants: int = 2, resting: int = 0
+    folder: Path, variant: int, *, width: int = 32, height: int = 24, instants: int = 2, resting: int = 0, side: int = 3
 ) -> Path:
     """Write the shard `toy-VARIANT` of one rig and return its path; it sees the world at rest too, `resting` times."""
-    world = ToyWorld(width=width, height=height, seed=variant)
+    world = ToyWorld(width=width, height=height, side=side, seed=variant)
     bursts = [toy_burst(world, t) for t in np.linspace(0.3, 0.7, instants)]
     traced = [world.trace(camera, 1e3) for camera in world.cameras]  # the board is far outside all images
     static = [tuple(np.array([maps[k] for maps in traced], np.float32) for k in range(2))]

@@ -27,6 +27,12 @@ def run_neurons(rate: NDArray[np.floating], charge: NDArray[np.floating], ticks:
     return spikes
 
 
+def few_views(scene: TrainingScene, *chosen: int) -> TrainingScene:
+    """Return a scene of some of its views."""
+    names = ("cameras", "streams", *(["recordings"] if scene.recordings else []))
+    return replace(scene, **{name: tuple(getattr(scene, name)[i] for i in chosen) for name in names})
+
+
 @dataclass(frozen=True)
 class ToyWorld:
     """A square array of cameras 4 m in front of a wall; the board between moves `travel` m to the right in the clip."""
@@ -39,6 +45,7 @@ class ToyWorld:
     seed: int = 0
     lens: tuple[float, ...] = ()  # of every camera
     spread: float = 0.0  # of the cameras' focal lengths, and of their principal points in image widths
+    views: tuple[int, ...] = ()  # those of all cameras but the centre one that record the training scene; all if empty
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
@@ -150,8 +157,9 @@ class ToyWorld:
 
     @cached_property
     def training(self) -> TrainingScene:
-        """All cameras but the centre one."""
+        """All cameras but the centre one, or `views` of them: what works on pairs takes the square of their number."""
         chosen = [(i, c) for i, c in enumerate(self.cameras) if c is not self.held_out]
+        chosen = [chosen[k] for k in self.views] or chosen
         streams = tuple(self.stream(c, i) for i, c in chosen)
         cameras = tuple(c for _, c in chosen)
         return TrainingScene("toy", f"toy-{self!r}", cameras, streams, RATE_HZ, self.n_ticks, GAIN)

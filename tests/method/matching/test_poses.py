@@ -119,27 +119,22 @@ def test_averages_of_exact_pairs_are_exact() -> None:
     np.testing.assert_allclose(found[1], true.centers / scale, atol=0.05)
 
 
-@pytest.mark.parametrize(
-    ("views", "seed", "turn_deg", "way_deg"), [(3, 0, 0.6, 10.0), (8, 1, 0.2, 3.0), (8, 2, 0.2, 3.0)]
-)
+@pytest.mark.parametrize(("views", "seed", "turn_deg", "way_deg"), [(3, 0, 0.6, 10.0), (6, 1, 0.2, 3.0)])
 def test_an_array_is_found_from_noisy_and_wrong_matches(views: int, seed: int, turn_deg: float, way_deg: float) -> None:
     rng = np.random.default_rng(seed)
     true = true_array(views, rng)
     solved = check(solve(matches_of(true, rng, noise=0.3, wrong=0.2), true.K), true, turn_deg, way_deg)
     sights = solved.tracks
     scale = np.sqrt((true.centers**2).sum(1)[1:].mean())
-    depth = (
-        1
-        / solved.adjusted.inverse_depth[np.bincount(sights.track, minlength=len(sights.anchor)) >= min(views - 1, 4)]
-        * scale
-    )
+    of_many = np.bincount(sights.track, minlength=len(sights.anchor)) >= min(views - 1, 4)
+    depth = scale / solved.adjusted.inverse_depth[of_many]
     assert 0.7 < np.quantile(depth, 0.1) and np.quantile(depth, 0.9) < 1.8
 
 
 def test_a_narrow_array_is_found() -> None:
     rng = np.random.default_rng(5)
-    true = true_array(8, rng, baseline=0.04)
-    check(solve(matches_of(true, rng, noise=0.2), true.K), true, 0.3, 5.0)
+    true = true_array(5, rng, baseline=0.04)
+    check(solve(matches_of(true, rng, noise=0.2, count=100), true.K), true, 0.3, 5.0)
 
 
 def test_the_focal_length_is_found_too() -> None:

@@ -130,12 +130,11 @@ def test_without_any_good_point_nothing_is_raised() -> None:
 
 def test_the_same_seed_gives_the_same_poses() -> None:
     rng = np.random.default_rng(3)
-    points = seen()[:3].repeat(2, axis=1).repeat(2, axis=2)  # more than the solver takes: the seed chooses among them
+    points = seen()[:2].repeat(2, axis=1).repeat(2, axis=2)  # more than the solver takes: the seed chooses among them
     points += 0.05 * rng.normal(size=points.shape)
-    finer = K[:3] * [[2], [2], [1]]
-    a, b, c = (solve_poses(points, np.ones(points.shape[:3]), finer, seed) for seed in (2**62, 2**62, 1))
-    for x, y, z in zip(a[1:], b[1:], c[1:], strict=True):
-        assert x.found and np.array_equal(x.w2c, y.w2c) and not np.array_equal(x.w2c, z.w2c)
+    finer = K[:2] * [[2], [2], [1]]
+    a, b, c = (solve_poses(points, np.ones(points.shape[:3]), finer, seed)[1] for seed in (2**62, 2**62, 1))
+    assert a.found and np.array_equal(a.w2c, b.w2c) and not np.array_equal(a.w2c, c.w2c)
 
 
 def test_poses_of_a_batch() -> None:

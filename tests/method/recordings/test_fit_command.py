@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,6 +44,7 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, pack
 from spike4dgs.cli import main
 from spike4dgs.method import load_model
 from spike4dgs.method.recordings import fit as fit_module
+from spike4dgs.method.recordings import report_page
 from spike4dgs.method.recordings.fit import MODEL, PREDICTIONS, REPORT, SHEET, VIDEO
 from spike4dgs.method.recordings.held_out import SHOWN, HeldOutView, held_out_views
 from spike4dgs.method.recordings.recording import open_recording, own_frame, streams_revision
@@ -92,9 +94,12 @@ def _short_videos() -> Iterator[None]:
 
 
 @pytest.fixture
-def no_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A gray pixel for the sheet, which takes as long as all the rest."""
-    monkeypatch.setattr(fit_module, "write_sheet", lambda path, *_: Image.new("L", (1, 1)).save(path))
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gray pixel for the sheet and the report's plot, which take as long as all the rest."""
+    pixel = Image.new("L", (1, 1))
+    pixel.save(png := BytesIO(), "png")
+    monkeypatch.setattr(fit_module, "write_sheet", lambda path, *_: pixel.save(path))
+    monkeypatch.setattr(report_page, "poses_plot", lambda *_: png.getvalue())
 
 
 def tensors(out: Path) -> dict[str, torch.Tensor]:
@@ -174,7 +179,7 @@ def test_other_commands_take_the_model(fitted: Path, recorded: Path, tmp_path: P
     assert len(list(out.iterdir())) == 5
 
 
-def test_no_file_of_truth_is_read(tmp_path: Path, no_sheet: None, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_file_of_truth_is_read(tmp_path: Path, no_plots: None, capsys: pytest.CaptureFixture[str]) -> None:
     whole = write_small_scene(tmp_path / "whole")
     bare = Path(shutil.copytree(whole, tmp_path / "bare"))
     for name in ("images", "masks", "geometry", "truth"):
@@ -183,7 +188,7 @@ def test_no_file_of_truth_is_read(tmp_path: Path, no_sheet: None, capsys: pytest
     write_json(bare / "targets.json", {"targets": []})
     write_manifest(bare)
     for scene in (whole, bare):
-        arguments = ["fit", str(scene), "--method", "tfp+4dgs", "--out", str(tmp_path / f"{scene.name}-fit"), *QUICK]
+        arguments = ["fit", str(scene), "--method", "tfp+static", "--out", str(tmp_path / f"{scene.name}-fit"), *QUICK]
         assert main(arguments) == 0
     assert same_model(tmp_path / "whole-fit", tmp_path / "bare-fit")
     said = capsys.readouterr().out
@@ -210,7 +215,7 @@ class Gray:
 
 
 def test_a_model_that_cannot_be_saved_has_reports_and_no_file_of_an_earlier_one_beside(
-    fitted: Path, recorded: Path, tmp_path: Path, no_sheet: None, monkeypatch
+    fitted: Path, recorded: Path, tmp_path: Path, no_plots: None, monkeypatch
 ) -> None:
     entry = SimpleNamespace(name="theirs", value="theirs:METHODS", dist=None, load=lambda: {"gray": Gray()})
     monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
@@ -224,7 +229,7 @@ def test_a_model_that_cannot_be_saved_has_reports_and_no_file_of_an_earlier_one_
     assert "cannot be saved" in (out / REPORT).read_text()
 
 
-def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, no_sheet: None, capsys) -> None:
+def test_held_out_cameras_are_judged_by_their_own_spikes(tmp_path: Path, no_plots: None, capsys) -> None:
     bare = write_small_scene(tmp_path / "scene")
     for name in ("images", "masks"):
         shutil.rmtree(bare / name)
@@ -255,12 +260,11 @@ def test_the_revision_of_streams_is_that_of_their_description_too(tmp_path: Path
     assert streams_revision(order) == streams_revision(open_stream_folder(tmp_path)) == streams_revision(given)
 
 
-def test_streams_without_poses_get_estimated_ones(tmp_path: Path, no_sheet: None, capsys) -> None:
+def test_streams_without_poses_get_estimated_ones(tmp_path: Path, no_plots: None, capsys) -> None:
     folder = tmp_path / "_my streams, ä"  # a model's file names it
     write_stream_folder(folder, write_streams(folder))
     out = tmp_path / "out"
-    arguments = ["fit", str(folder), "--method", "tfp+4dgs", "--out", str(out), *QUICK]
-    assert main(arguments) == 0
+    assert main(["fit", str(folder), "--method", "tfp+static", "--out", str(out), *QUICK]) == 0
     said = capsys.readouterr().out
     assert "poses: estimated with COLMAP" in said and "white is taken to be" in said
     assert "estimated with COLMAP" in (out / REPORT).read_text()
@@ -307,7 +311,7 @@ def test_streams_that_do_not_belong_together_or_are_dark_are_refused(tmp_path: P
         open_recording(tmp_path)
 
 
-def test_a_second_run_makes_only_the_reports_again(fitted: Path, recorded: Path, tmp_path, no_sheet: None) -> None:
+def test_a_second_run_makes_only_the_reports_again(fitted: Path, recorded: Path, tmp_path, no_plots: None) -> None:
     out = Path(shutil.copytree(fitted, tmp_path / "out"))
     (out / REPORT).unlink()
     before, half = (out / MODEL).stat().st_mtime_ns, leave_part(out)
@@ -347,7 +351,7 @@ def test_the_folder_of_a_benchmark_is_refused(recorded: Path, tmp_path: Path, ca
     assert of_a_run.exists() and not (tmp_path / MODEL).exists()
 
 
-def test_a_killed_fit_resumes(recorded: Path, tmp_path: Path, no_sheet: None, capsys) -> None:
+def test_a_killed_fit_resumes(recorded: Path, tmp_path: Path, no_plots: None, capsys) -> None:
     out = tmp_path / "out"
     arguments = ["fit", str(recorded), "--method", "tfp+static", "--out", str(out), *QUICK]
     code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from moving_world import MovingWorld
 from toy_fits import MOTIONS, SUPERVISIONS, images, request
-from toy_world import ToyWorld
+from toy_world import ToyWorld, few_views
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Recipe
+from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.recipes import METHODS
 from spike4dgs.method.starts.array_motion import Explained, _sampled
@@ -29,9 +30,15 @@ def said() -> io.StringIO:
 
 
 @pytest.fixture(scope="module")
-def start(said: io.StringIO) -> Start:
+def scene() -> TrainingScene:
+    """Four views beside the middle one."""
+    return few_views(WORLD.training, 1, 3, 4, 6)
+
+
+@pytest.fixture(scope="module")
+def start(scene: TrainingScene, said: io.StringIO) -> Start:
     with redirect_stderr(said):
-        return rig(WORLD.training, FOLLOWS)
+        return rig(scene, FOLLOWS)
 
 
 def test_the_path_is_found_to_a_fraction_of_a_pixel(start):
@@ -52,18 +59,17 @@ def test_it_is_said_in_one_line(start, said):
     assert text.startswith(f"{WORLD.training.id}: the array moves, the image by ") and text.count("\n") == 1
 
 
-def test_a_view_on_whose_depths_no_other_agrees_has_no_say():
+def test_a_view_on_whose_depths_no_other_agrees_has_no_say(scene):
     image = np.random.default_rng(0).random((8, 9, 3)).astype(np.float32)
     assert _sampled(image, np.empty((0, 2))).shape == (0, 3)
-    dark = replace(WORLD.training.streams[3], packed=np.zeros_like(WORLD.training.streams[3].packed))
-    streams = (*WORLD.training.streams[:3], dark, *WORLD.training.streams[4:])
-    found = rig(replace(WORLD.training, streams=streams), FOLLOWS)
+    dark = replace(scene.streams[3], packed=np.zeros_like(scene.streams[3].packed))
+    found = rig(replace(scene, streams=(*scene.streams[:3], dark)), FOLLOWS)
     assert np.isfinite(found.points).all() and len(found.points) > 100
 
 
 def test_an_array_that_stands_still_has_no_path_and_the_same_start(capsys):
     """Although a large board flies past."""
-    still = ToyWorld(width=96, height=60, n_ticks=240, travel=1.2, seed=1).training
+    still = ToyWorld(width=96, height=60, n_ticks=240, travel=1.2, seed=1, views=(0, 2, 5, 7)).training
     found, plain = rig(still, FOLLOWS), rig(still, RigSettings())
     assert found.path is None and not capsys.readouterr().err
     assert np.array_equal(found.points, plain.points) and np.array_equal(found.values, plain.values)
