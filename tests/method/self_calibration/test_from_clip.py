@@ -12,7 +12,7 @@ from warm_cameras import warm_scene
 from spike4dgs.generators.physics import Physics, given_cameras
 from spike4dgs.method.self_calibration.from_clip import as_in_clip, at_mended_poses
 
-WORLD = ClockWorld(width=240, height=152, n_ticks=48, travel=0.1, views=(0, 2, 5, 7))  # six pairs, of 28
+WORLD = ClockWorld(width=192, height=122, n_ticks=96, travel=0.1, views=(0, 2, 5, 7))  # six pairs, of 28
 
 
 def turns_px(cameras) -> float:
@@ -26,7 +26,7 @@ def turns_px(cameras) -> float:
 
 def test_right_poses_stay_and_poses_a_little_off_are_mended(capsys: pytest.CaptureFixture[str]) -> None:
     assert as_in_clip(WORLD.training, 0, poses=True) is WORLD.training
-    given = given_cameras(WORLD.training.cameras, "none", Physics(pose_noise_deg=0.03), [2])
+    given = given_cameras(WORLD.training.cameras, "none", Physics(pose_noise_deg=0.0375), [2])
     off = replace(WORLD.training, cameras=given)
     found = as_in_clip(off, 0, poses=True).cameras
     assert turns_px(found) < 0.5 * turns_px(given)
@@ -41,9 +41,8 @@ def test_other_dark_rates_are_told(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_clip_that_shows_too_little_changes_nothing() -> None:
-    off = replace(
-        WORLD.training, cameras=given_cameras(WORLD.training.cameras, "none", Physics(pose_noise_deg=0.03), [0])
-    )
+    given = given_cameras(WORLD.training.cameras, "none", Physics(pose_noise_deg=0.0375), [0])
+    off = replace(WORLD.training, cameras=given)
     one = few_views(off, 0)
     black = replace(off, streams=tuple(replace(s, packed=np.zeros_like(s.packed)) for s in off.streams))
     for scene in (one, black):

@@ -134,8 +134,7 @@ def shown(path: Path) -> list[np.ndarray]:
     return frames
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
-@pytest.mark.parametrize("path", ["orbit", "still"])
+@pytest.mark.parametrize(("path", "suffix"), [("orbit", ".mp4"), ("still", ".avi")])
 def test_a_video_has_the_frames_of_the_model(saved: Path, tmp_path: Path, path: PathName, suffix: str) -> None:
     out, frames = tmp_path / f"v{suffix}", tmp_path / "frames"
     options = ["--path", path, "--slow-motion", "48", "--fps", "25", "--out", str(out), "--frames", str(frames)]
