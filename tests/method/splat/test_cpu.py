@@ -1,10 +1,7 @@
 """The CPU kernels against the float64 reference: images, gradients, determinism, errors."""
 
-import subprocess
-import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 import splat_parity
@@ -20,8 +17,6 @@ from spike4dgs.method.splat import PixelFilter, Splats, Views, cpu, render, set_
 from spike4dgs.method.splat.api import Backend
 from spike4dgs.method.splat.kernels.threads import work_alone
 
-SUPPORT = Path(splat_parity.__file__).parent
-
 
 def compare(splats: Splats, v: Views, **options: bool) -> None:
     splat_parity.compare(splats, v, "cpu", **options)
@@ -33,10 +28,13 @@ def test_hard_scenes_in_float32(scene: Callable[[], tuple[Splats, Views]]) -> No
     compare(Splats(*(t[:200].float() for t in splats.tensors)), v)
 
 
-@pytest.mark.parametrize("depth", [False, True])
-@pytest.mark.parametrize("channels", range(1, 10))
+# Kernels exist for 1, 2 and 4 layers: one alone, with the depth, a place left over, full, and more than one pass.
+LAYERS = [(1, False), (1, True), (2, False), (2, True), (3, True), (4, False), (4, True), (7, True), (9, False)]
+
+
+@pytest.mark.parametrize(("channels", "depth"), LAYERS)
 def test_any_number_of_channels(channels: int, depth: bool) -> None:
-    compare(random_splats(120, channels, seed=20), views(), depth=depth)
+    compare(random_splats(60, channels, seed=20), views(), depth=depth)
 
 
 @settings(max_examples=15, deadline=None)
@@ -141,23 +139,3 @@ def test_an_image_that_was_changed_in_place_has_no_wrong_gradient() -> None:
     image += 0.5
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         image.square().sum().backward()
-
-
-def test_a_second_process_compiles_nothing() -> None:
-    """The kernels come from numba's cache, also those that exist once per number of channels."""
-    render(random_splats(5, 1), views(1))
-    code = (
-        "import sys\n"
-        f"sys.path.insert(0, {str(SUPPORT)!r})\n"
-        "from splat_scenes import random_splats, views\n"
-        "from spike4dgs.method.splat import render\n"
-        "from spike4dgs.method.splat.kernels import project\n"
-        "from spike4dgs.method.splat.kernels.raster import raster_kernels\n"
-        "from spike4dgs.method.splat.kernels.vector_ir import host_lanes\n"
-        "render(random_splats(5, 1), views(1))\n"
-        "used = [project.project_forward, raster_kernels(host_lanes(), 1)[0]]\n"
-        "print([sum(k.stats.cache_misses.values()) for k in used])\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[0, 0]"
-    assert "compiling" not in done.stderr
