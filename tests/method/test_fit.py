@@ -21,12 +21,14 @@ from spike4dgs.method.training_views.warm_up_scene import radiance_of, warm_up_s
 METHODS = find_methods()
 
 WORLD = ToyWorld(width=64, height=40, n_ticks=240, travel=0.4)  # 10 px in 12 ms
+FEW = replace(WORLD, side=2)  # cameras: their depths take most of a short fit
 SHORT = Budget(scale=0.005)
 
 
 @cache
 def fitted(name: str) -> Model:
-    return METHODS[name].fit(WORLD.training, FitRequest(Budget(scale=0.2)))
+    scale = 0.12 if name == "tfp+static" else 0.2  # a static one's board is no better after more steps
+    return METHODS[name].fit(WORLD.training, FitRequest(Budget(scale=scale)))
 
 
 @cache
@@ -43,7 +45,7 @@ def test_a_deforming_scene_beats_a_static_one_and_the_nearest_view(moving: bool)
 
 def test_a_model_has_the_filter_that_its_recipe_fits_with() -> None:
     """A published row's is customary; the reference method's is a pixel's own."""
-    ours = METHODS["spike4dgs-x"].fit(WORLD.training, FitRequest(SHORT))
+    ours = METHODS["spike4dgs-x"].fit(FEW.training, FitRequest(SHORT))
     for model, expected in ((fitted("tfp+4dgs"), PixelFilter()), (ours, PixelFilter(1 / 12, compensated=True))):
         assert isinstance(model, FittedModel) and model.pixel_filter == expected
 
@@ -58,7 +60,7 @@ def test_a_model_renders_the_same_bits_again_and_stops_at_the_ends_of_the_clip()
 
 
 def bits(seed: int = 0, name: str = "tfp+4dgs") -> dict[str, torch.Tensor]:
-    model = METHODS[name].fit(WORLD.training, FitRequest(SHORT, seed=seed))
+    model = METHODS[name].fit(FEW.training, FitRequest(SHORT, seed=seed))
     assert isinstance(model, FittedModel)
     (gaussians,) = model.pieces
     return {**gaussians.tensors(), **model.motion.state_dict()}

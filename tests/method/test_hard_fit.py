@@ -17,7 +17,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.gaussians.parameters import from_points
-from spike4dgs.method.images.training import ImageSettings, make_training_images
+from spike4dgs.method.images.training import ImageSettings, make_training_images, wanted_images
 from spike4dgs.method.schedule import TrainerSettings
 from spike4dgs.method.splat import render
 from spike4dgs.method.starts.base import Start, measure
@@ -28,7 +28,7 @@ from spike4dgs.method.training_views.training_images import TrainingImages
 SETTINGS = TrainerSettings(coarse_steps=3, fine_steps=9, piece_steps=3, views_per_step=3)
 SMALL = {"hexplane": {"mlp_width": 8, "features": 4}}  # of the motion
 FEW = ImageSettings(time_spacing_ticks=20, max_times=4, flat_field=True)
-HEIGHT, WIDTH, TICKS = 40, 64, 120
+HEIGHT, WIDTH, TICKS = 30, 48, 120
 
 
 @cache
@@ -139,7 +139,8 @@ def test_losses_gradients_and_parameters_are_numbers(
     first, training_images = replace(start(), cameras=scene.cameras), seen(name, images, device)
     kind, comparison = MOTIONS[motion], SUPERVISIONS[supervision]
     sizes = replace(kind.defaults, **SMALL.get(motion, {}))
-    model = kind(measure(first, scene), sizes, seeded(0, -1)).to(device)
+    extent = replace(measure(first, scene), images=wanted_images(scene.n_ticks, ImageSettings()))  # as in a fit
+    model = kind(extent, sizes, seeded(0, -1)).to(device)
     gaussians = model.initialize(
         from_points(first.points[::8], first.values[::8], opacity=0.5, device=device), training_images
     )

@@ -14,7 +14,6 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, get_method
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.images.training import ImageSettings, choose_ticks
-from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, stages
 from spike4dgs.method.settings import as_dict, in_budget, make_settings, override
 from spike4dgs.method.splat import render
@@ -27,16 +26,11 @@ from spike4dgs.method.training_views.points import variation_at
 from spike4dgs.method.training_views.training_images import Spans, TrainingImages
 
 
-@cache
-def fitted(motion: str) -> FittedModel:
-    extra = {"trainer.coarse_steps": 120} if motion == "static" else {"trainer.fine_steps": 180}
-    return method(motion, extra).fit(WORLD.training, request())
-
-
-@pytest.mark.parametrize("motion", ["hexplane", "spacetime"])
-def test_a_moving_board_is_seen_from_a_new_viewpoint_better_than_by_a_static_scene(motion: str):
-    assert WORLD.psnr(fitted(motion), moving=True) > WORLD.psnr(fitted("static"), moving=True) + 2
-    assert motion != "hexplane" or WORLD.psnr(fitted(motion), moving=False) > 25
+def test_a_moving_board_is_seen_from_a_new_viewpoint_better_than_by_a_static_scene():
+    """By STG; 4DGS is in `test_fit`."""
+    steps = {"spacetime": {"trainer.fine_steps": 180}, "static": {"trainer.coarse_steps": 120}}
+    moving, static = (method(motion, extra).fit(WORLD.training, request()) for motion, extra in steps.items())
+    assert WORLD.psnr(moving, moving=True) > WORLD.psnr(static, moving=True) + 2
 
 
 @pytest.mark.parametrize("motion", ["paths", "hexplane"])
@@ -80,7 +74,7 @@ def wide_spans(images: TrainingImages) -> Spans:
 
 def test_means_over_time_are_corrected_by_snapshots_of_the_stage() -> None:
     """From 30 % of the deforming stage on the fit compares with instants; the static stage with what was measured."""
-    fit, seen = trainer(40, motion="paths", spans=wide_spans), []
+    fit, seen = trainer(24, motion="paths", spans=wide_spans), []
     loss = fit.supervision.forward
     fit.supervision.forward = lambda render, sample: (seen.append(sample), loss(render, sample))[1]
     while fit.step < fit.total:
@@ -105,7 +99,7 @@ def test_means_over_time_are_corrected_by_snapshots_of_the_stage() -> None:
 
 def test_corrections_made_ahead_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     def fit() -> Trainer:
-        made = trainer(40, motion="paths", spans=wide_spans)
+        made = trainer(24, motion="paths", spans=wide_spans)
         made.run(silent)
         assert not any(t.name == "corrections" for t in threading.enumerate()), "nothing works on after a fit"
         return made
@@ -124,7 +118,7 @@ def test_a_fit_is_freed_at_its_end() -> None:
     gc.collect()
     gc.disable()
     try:
-        fit = trainer(40, motion="paths", spans=wide_spans)
+        fit = trainer(24, motion="paths", spans=wide_spans)
         fit.run(silent)
         freed = weakref.ref(fit)
         del fit
@@ -134,7 +128,7 @@ def test_a_fit_is_freed_at_its_end() -> None:
 
 
 def test_a_fit_that_is_interrupted_leaves_nothing_working() -> None:
-    fit = trainer(40, motion="paths", spans=wide_spans)
+    fit = trainer(24, motion="paths", spans=wide_spans)
 
     def interrupt(done: int, total: int, note: str) -> None:
         if fit.corrections:
@@ -209,12 +203,13 @@ def bits(t: dict[str, torch.Tensor]) -> bytes:
 @pytest.mark.parametrize(
     ("parts", "step"),
     [
-        *(("hexplane", s) for s in (1, 3, 4, 5, 6, 8, 11)),
-        *((p, s) for p in ("spacetime", "spike-render", "fixed-pattern") for s in (3, 6, 9)),
+        *(("hexplane", s) for s in (1, 3, 4, 5, 11)),
+        *(("spacetime", s) for s in (3, 6, 9)),
+        *((p, s) for p in ("spike-render", "fixed-pattern") for s in (3, 6)),
         *(("paths", s) for s in (7, 8, 9, 15)),
         ("poses", 5),
         *(("average", s) for s in (2, 3, 4, 10, 11)),
-        *(("spans", s) for s in (8, 12, 13, 14, 20)),
+        *(("spans", s) for s in (12, 13, 14)),
     ],
 )
 def test_killed_at_any_step_and_resumed_gives_the_same_bits(parts, step, tmp_path, hard_case: HardCase):
