@@ -36,7 +36,7 @@ def compiled():
     return {(d.py_func.__module__, d.py_func.__qualname__, str(s)) for d in found for s in d.overloads}
 
 METHODS = find_methods()
-world = ToyWorld(width=48, height=30, n_ticks=120)
+world = ToyWorld(width=48, height=30, n_ticks=120, side=2)
 _ = world.training.streams
 for name in NAMES:
     METHODS[name].warm_up(FitRequest())
