@@ -182,7 +182,7 @@ def test_images_of_a_recording_whose_gaps_were_corrected_are_not_kept(
     arguments = ["images", str(small_scene), "--camera", "cam_01", "--out", str(tmp_path / "out"), "--allow-gaps"]
     add_gap(small_scene, "cam_01", 35, 10)
     assert main(arguments) == 0
-    add_gap(small_scene, "cam_01", 35, 30)
+    add_gap(small_scene, "cam_01", 45, 20)
     assert main(arguments) == 2 and "out/cam_01" in capsys.readouterr().err
 
 

@@ -169,10 +169,10 @@ def test_scenes_without_recordings_are_refused(tmp_path, small_scene):
 def test_two_calibrations_into_one_folder_exclude_each_other(tmp_path: Path) -> None:
     with locked(tmp_path / ".lock", "x", "free"), pytest.raises(UserError, match="found a run in progress; wait"):
         calibrate(write_small_scene(tmp_path / "scene"), out=tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "scene"]
 
 
 def test_maps_of_two_scenes_are_not_mixed(tmp_path: Path) -> None:
     write_maps(tmp_path / "maps/cam_99.npz", {"gain": np.ones((2, 2), np.float32)})
     with pytest.raises(UserError, match="expected a folder for this scene's maps, found cam_99.npz of another scene"):
         calibrate(write_small_scene(tmp_path / "scene"), out=tmp_path / "maps")
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".lock", "scene"]
