@@ -116,7 +116,7 @@ def test_resumes_after_an_interruption_at_every_step(fake, tmp_path):
     assert files_in(folder) == whole
 
 
-ALSO = ("light=0.25 pose-noise-deg=0.1", "lost-ticks=0.05", "flicker=0.08", "warming-k=8 read-noise=0.01")
+ALSO = ("light=0.25 pose-noise-deg=0.1 lost-ticks=0.05 warming-k=8 read-noise=0.01", "flicker=0.08")
 
 
 def count_keys(monkeypatch):
@@ -196,22 +196,6 @@ def test_options_of_further_scenes_are_those_of_camera_and_light(fake, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def test_other_settings_do_not_reuse_unfinished_work(fake, tmp_path):
-    def stop_at_truth(stage, steps, total):
-        if stage == "ground truth":
-            raise Stop
-        yield from steps
-
-    other = replace(JOB, seed=7)
-    with pytest.raises(Stop):
-        Maker(other, tmp_path / "a", stop_at_truth).make()
-    mixed = files_in(Maker(JOB, tmp_path / "a", plain).make())
-    clean = files_in(Maker(JOB, tmp_path / "b", plain).make())
-    seven = files_in(Maker(other, tmp_path / "c", plain).make())
-    assert mixed == clean
-    assert seven["spikes/cam_00.dat"] != clean["spikes/cam_00.dat"]
-
-
 def test_code_of_unfinished_work_is_this_room_the_benchmark_and_another_packages_world(monkeypatch):
     def hashed(world):
         names = []
@@ -226,7 +210,7 @@ def test_code_of_unfinished_work_is_this_room_the_benchmark_and_another_packages
     assert hashed("theirs") == [*ours, files_in.__module__]
 
 
-def test_unfinished_work_of_other_code_is_made_anew(fake, monkeypatch, tmp_path):
+def test_unfinished_work_of_other_settings_or_code_is_made_anew(fake, monkeypatch, tmp_path):
     rendered = count_keys(monkeypatch)
 
     def stop_at_truth(stage, steps, total):
@@ -234,26 +218,26 @@ def test_unfinished_work_of_other_code_is_made_anew(fake, monkeypatch, tmp_path)
             raise Stop
         yield from steps
 
-    def keys_and_shared():
+    def keys_and_shared(job):
         rendered.clear()
-        maker = SharingMaker(JOB, tmp_path, stop_at_truth)
+        maker = SharingMaker(job, tmp_path, stop_at_truth)
         with pytest.raises(Stop):
             maker.make()
         return len(rendered), maker._shared
 
-    (keys, shared), again = keys_and_shared(), keys_and_shared()
+    (keys, shared), again, (anew, other) = (keys_and_shared(job) for job in (JOB, JOB, replace(JOB, seed=7)))
     assert keys and again == (0, shared)
+    assert anew == keys and other != shared
     monkeypatch.setattr(scene_maker, "_sources", lambda world: "of a world that was edited")
-    anew, other = keys_and_shared()
+    anew, other = keys_and_shared(JOB)
     assert anew == keys and other != shared
 
 
-def test_maps_that_are_off_leave_no_file_and_change_the_stream(fake, tmp_path):
-    off = files_in(Maker(replace(JOB, gain_map=False, dark_map=False), tmp_path / "off", plain).make())
-    on = files_in(Maker(JOB, tmp_path / "on", plain).make())
-    assert off["spikes/cam_00.dat"] != on["spikes/cam_00.dat"]
-    assert "truth/cam_00.npz" in on
-    assert not [name for name in off if name.startswith("truth/")]
+def test_maps_and_seeds_change_the_stream_and_maps_that_are_off_leave_no_file(fake, tmp_path):
+    others = {"on": {}, "off": {"gain_map": False, "dark_map": False}, "seven": {"seed": 7}}
+    on, off, seven = (files_in(Maker(replace(JOB, **o), tmp_path / name, plain).make()) for name, o in others.items())
+    assert len({made["spikes/cam_00.dat"] for made in (on, off, seven)}) == 3
+    assert "truth/cam_00.npz" in on and not [name for name in off if name.startswith("truth/")]
 
 
 def test_two_processes_do_not_make_one_scene(fake, monkeypatch, tmp_path):
@@ -386,9 +370,11 @@ def test_folders_that_cannot_be_written_are_one_error(worlds, fake, tmp_path):
     assert (tmp_path / "file").read_text() == "no folder"
 
 
-def test_a_variant_of_seasons_is_named_as_such(fake, tmp_path, capsys):
+def test_a_variant_of_seasons_is_named_as_such(tmp_path, capsys):
     for variant, kept in ((8999, False), (9000, True)):
-        assert make("car", variant=variant, out=tmp_path) == 0
+        (tmp_path / f"car-{variant}-tiny").mkdir()
+        with pytest.raises(UserError, match="move them away"):  # it is said before any work
+            make("car", variant=variant, out=tmp_path)
         assert (f"variant {variant} is kept for hidden seasons" in capsys.readouterr().out) is kept
 
 

@@ -17,17 +17,12 @@ from scipy.ndimage import binary_erosion, map_coordinates
 
 from spike4dgs.benchmark.scene.images import read_geometry
 from spike4dgs.benchmark.scene.scene import Target, open_scene
-
-
-def start(out, *more, worlds=("car",)):
-    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["make-dataset", *worlds, "--profile", "tiny", "--out", str(out), *more]
-    return subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+from spike4dgs.cli import main
 
 
 def kill_when(process, pattern: str, folder: Path, count: int):
     """Send SIGKILL as soon as `count` files match; return at once if the process has ended."""
-    until = time.monotonic() + 100
+    until = time.monotonic() + 400
     while process.poll() is None and len(list(folder.glob(pattern))) < count and time.monotonic() < until:
         time.sleep(0.002)
     assert process.poll() is None, process.stdout.read().decode()
@@ -79,26 +74,32 @@ def test_flow_and_depth_of_a_scene_carry_its_images_over(tiny_data):
 
 
 @pytest.mark.slow
-def test_a_scene_killed_on_a_cluster_and_finished_beside_another_has_the_bytes_of_one_made_alone(whole, tmp_path):
+def test_a_scene_killed_on_a_cluster_and_finished_beside_another_has_the_bytes_of_one_made_alone(
+    whole, tmp_path, capfd
+):
     """The cluster makes background, keys and truth; one of two workers does what is missing, the other one a scene.
 
     Two keys and a mask are taken away, so that there is something missing of each kind whenever the signal came.
     """
     from distributed import LocalCluster
 
-    work = tmp_path / ".work/car-0-tiny"
+    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
+    work, options = tmp_path / ".work/car-0-tiny", ["--profile", "tiny", "--out", str(tmp_path)]
     quiet = {"processes": True, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": ":0"}
     with LocalCluster(**quiet, silence_logs=50) as cluster:
-        kill_when(start(tmp_path, "--scheduler", cluster.scheduler_address), "scene/masks/*/*.png", work, 1)
+        command = [sys.executable, "-c", code, "make-dataset", "car", *options]
+        command += ["--scheduler", cluster.scheduler_address]
+        killed = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        kill_when(killed, "scene/masks/*/*.png", work, 1)
     assert not (tmp_path / "car-0-tiny").exists()
     assert len(keys := sorted((work / "keys").glob("0*.npz"))) == 5
     for path in (*keys[1:3], next(work.glob("scene/masks/*/*.png"))):
         path.unlink()
-    output, _ = (process := start(tmp_path, "--workers", "2", worlds=("blank", "car"))).communicate(timeout=300)
-    assert process.returncode == 0, output.decode()
+    assert main(["make-dataset", "blank", "car", *options, "--workers", "2"]) == 0
+    output = capfd.readouterr().out
     found = files_in(tmp_path / "car-0-tiny")
     assert found["manifest.json"] == whole["manifest.json"] and found == whole
     assert open_scene(tmp_path / "blank-0-tiny").id == "blank-0-tiny"
     assert json.loads((tmp_path / "car-0-tiny.report.json").read_text())["plan"]["keys"] == 5
-    assert b"car-0-tiny (2 of 2): key frames 2/2" in output and b"car-0-tiny (2 of 2): background" not in output
+    assert "car-0-tiny (2 of 2): key frames 2/2" in output and "car-0-tiny (2 of 2): background" not in output
     assert not (tmp_path / ".work").exists()

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from built_worlds import built
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.keyframes import KeyStore
-from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
-from spike4dgs.generators.rig import cameras
+from spike4dgs.generators.rendering.render import StaticViews
 from spike4dgs.generators.sensor.reference import tick_means
 
 SHAPE = (2, 9, 13)
@@ -146,56 +142,3 @@ def test_damage_and_bad_images_are_named(store):
         store.put(20, sparse(fast, images[0] * np.float32(np.nan)))
     with pytest.raises(UserError, match="finite radiance"):
         store.set_static(StaticViews(static.background * np.float32(np.inf), static.first))
-
-
-WIDTH, HEIGHT, SPP = 64, 40, 32
-
-
-@pytest.fixture(scope="module")
-def r() -> MultiViewRenderer:
-    turntable = built("turntable")
-    return MultiViewRenderer(turntable, cameras(turntable, WIDTH, HEIGHT, (1, 4)), seed=0, spp=SPP, background_spp=256)
-
-
-def test_a_renderer_continues_from_the_background_of_another(r):
-    plan = KeyPlan(400, 20_000, 0.05, (20, 4, 2))
-    first = r
-    static = StaticViews.from_arrays(first.static.arrays())
-    second = MultiViewRenderer(r.world, first.cameras, seed=0, spp=SPP, background_spp=256, static=static)
-    for tick in (200, 202, 204):
-        a, b = first.key_arrays(tick, plan), second.key_arrays(tick, plan)
-        assert a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
-
-
-def test_fine_keys_give_fast_pixels_and_the_rest_is_close(r, tmp_path):
-    """Dense keys from a plan against images rendered at every tick: small errors, and none where keys are given."""
-    plan = KeyPlan(40, 20_000, 0.05, (20, 4, 2, 1))
-    store = KeyStore(tmp_path)
-    store.set_static(r.static)
-    for tick in (0, 4, 8, *range(10, 25), 28, 32, 36, 40):  # the disc turns steadily: one interval is enough
-        store.put(tick, r.key_arrays(tick, plan))
-    clip = store.instants(1, plan)
-    shares = []
-    for tick in (11, 13, 14, 16, 21, 22):
-        exact, traced = r.keys(tick / 20_000)[1], r.traced(tick / 20_000)[1]
-        given, values = store.given(tick, 1)
-        shares.append(given.sum() / traced.sum())
-        assert (traced | ~given).all()
-        assert np.array_equal(clip.keys[tick][given], exact[given]) and np.array_equal(values, exact[given])
-        error = np.abs(clip.keys[tick] - exact) / np.maximum(exact, 0.02)
-        assert error[traced].mean() < 0.004 and error[~traced].mean() < 0.001
-    assert min(shares) < 0.4 and max(shares) > 0.9  # fine ticks give the rim, coarser ones more
-
-
-def test_ticks_with_fast_motion_are_rendered_inside_the_tick():
-    """A disc that turns by 4 px a tick: the rendered mean is nearer to a fine mean than the mean of two keys is."""
-    slow = built("turntable")
-    spin = replace(slow, poses=lambda t: slow.poses(40 * t))
-    r = MultiViewRenderer(spin, cameras(spin, WIDTH, HEIGHT, (4,)), seed=0, spp=16, background_spp=16)
-    plan = KeyPlan(20, 20_000, 0.2, (1,), sub_ticks=8)
-    arrays = r.key_arrays(7, plan)
-    given = np.flatnonzero(np.unpackbits(arrays["mean_given0"], count=WIDTH * HEIGHT))
-    truth = np.mean([r._traced_at(given, (7 + (k + 0.5) / 10) / 20_000) for k in range(10)], axis=0)
-    two = (r._traced_at(given, 7 / 20_000) + r._traced_at(given, 8 / 20_000)) / 2
-    assert len(given) > 0.1 * WIDTH * HEIGHT
-    assert np.abs(arrays["mean_values0"] - truth).mean() < 0.35 * np.abs(two - truth).mean()

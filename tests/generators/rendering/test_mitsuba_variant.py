@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.cli import main
 from spike4dgs.generators.rendering import mitsuba_variant
 from spike4dgs.generators.rendering.mitsuba_variant import FAST, OVERRIDE, SAFE, load_mitsuba
 
@@ -74,26 +76,35 @@ def test_a_failure_that_may_pass_is_not_remembered(
     assert not list(tmp_path.glob("spike4dgs/mitsuba-*"))
 
 
-def test_asking_for_llvm_without_libllvm_is_one_clear_error(tmp_path: Path):
-    bogus = tmp_path / "libLLVM.so"
+@pytest.fixture
+def fresh_choice() -> Iterator[None]:
+    """The variant is picked anew in the test, and after it."""
+    mitsuba_variant.pick_variant.cache_clear()
+    yield
+    mitsuba_variant.pick_variant.cache_clear()
+
+
+@pytest.mark.usefixtures("fresh_choice")
+def test_asking_for_llvm_without_libllvm_is_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    bogus, out = tmp_path / "libLLVM.so", tmp_path / "data"
     bogus.write_bytes(b"not a library")
-    environment = {"DRJIT_LIBLLVM_PATH": str(bogus), "XDG_CACHE_HOME": str(tmp_path), OVERRIDE: FAST}
-    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
-    out = tmp_path / "data"
-    found = python(code, "make-dataset", "car", "--profile", "tiny", "--out", str(out), **environment)
-    assert found.returncode == 2 and "apt-get install libllvm19" in found.stderr.splitlines()[-1]
+    for name, value in (("DRJIT_LIBLLVM_PATH", bogus), ("XDG_CACHE_HOME", tmp_path), (OVERRIDE, FAST)):
+        monkeypatch.setenv(name, str(value))
+    assert main(["make-dataset", "car", "--profile", "tiny", "--out", str(out)]) == 2
+    assert "apt-get install libllvm19" in capsys.readouterr().err.splitlines()[-1]
     assert not out.exists() or not any(out.glob("*"))
 
 
+@pytest.mark.usefixtures("fresh_choice")
 def test_the_override_is_taken_or_refused(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv(OVERRIDE, SAFE)
-    mitsuba_variant.pick_variant.cache_clear()
     assert mitsuba_variant.pick_variant() == SAFE
     monkeypatch.setenv(OVERRIDE, "gpu")
     mitsuba_variant.pick_variant.cache_clear()
     with pytest.raises(UserError, match=f"{OVERRIDE}.*gpu"):
         mitsuba_variant.pick_variant()
-    mitsuba_variant.pick_variant.cache_clear()
 
 
 def test_scalar_and_vectorised_images_agree_within_noise(

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from built_worlds import built as world
+from built_worlds import forget_scenes
 from matplotlib.path import Path
 from scipy.ndimage import binary_erosion as erode
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
-from scipy.stats import norm
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.images import gray as gray_of
 from spike4dgs.generators.rendering.image_motion import KeyPlan
-from spike4dgs.generators.rendering.mitsuba_variant import load_mitsuba
-from spike4dgs.generators.rendering.render import MultiViewRenderer, make_tracer
+from spike4dgs.generators.rendering.keyframes import KeyStore
+from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews, make_tracer
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import Deforming, Part, WorldScene
 from spike4dgs.generators.worlds.meshes import merge, quad, rotation
 from spike4dgs.generators.worlds.surfaces import Material
 
-WIDTH, HEIGHT, SPP = 64, 40, 32
+WIDTH, HEIGHT, SPP, BACKGROUND_SPP = 64, 40, 32, 64
 NAMES = ["car", "turntable"]  # rigid; surfaces that deform are in the second half
 T_S = 0.0113
 NOISE = 0.03  # bound on the mean absolute error
@@ -36,36 +34,41 @@ one_world = pytest.mark.parametrize("r", ["turntable"], indirect=True)
 
 
 @pytest.fixture(scope="module", params=NAMES)
-def r(request) -> Iterator[MultiViewRenderer]:
+def r(request) -> MultiViewRenderer:
     """One renderer at a time for all tests of a world: LLVM recompiles for all scenes in memory."""
+    forget_scenes()
     rig = cameras(world(request.param), WIDTH, HEIGHT, (1, 4))
-    yield MultiViewRenderer(world(request.param), rig, seed=0, spp=SPP, background_spp=256)
-    gc.collect()
+    return MultiViewRenderer(world(request.param), rig, seed=0, spp=SPP, background_spp=BACKGROUND_SPP)
 
 
 @pytest.fixture(scope="module")
-def truth(r) -> np.ndarray:
-    return r.reference_frames(T_S, 256)
+def key(r) -> np.ndarray:
+    return r.keys(T_S)
 
 
-def test_keys_are_the_full_rendering_inside_and_the_background_outside(r):
-    key, traced, changed, mask = r.keys(T_S), r.traced(T_S), r.changed(T_S), r.object_masks(T_S)
+@pytest.fixture(scope="module")
+def full(r) -> np.ndarray:
+    return r.crn_frames(T_S)
+
+
+def test_keys_are_the_full_rendering_inside_and_the_background_outside(r, key, full):
+    traced, changed, mask = r.traced(T_S), r.changed(T_S), r.object_masks(T_S)
     assert 0.02 < traced.mean() < 0.6 and (traced <= changed).all() and not changed.all()
-    full, (background, same_numbers) = r.crn_frames(T_S), (gray_of(a) for a in r.static.arrays().values())
+    background, same_numbers = (gray_of(a) for a in r.static.arrays().values())
     assert np.array_equal(key[mask], full[mask])
     shadow = traced & ~mask  # the background and the difference that the shadow makes, from the same random numbers
     assert np.array_equal(key[shadow], np.maximum(full + (background - same_numbers), 0)[shadow])
     assert np.array_equal(key[~changed], r.background[~changed])
 
 
-def test_keys_are_close_to_mitsubas_own_rendering(r, truth):
-    key, traced = r.keys(T_S), r.traced(T_S)
+def test_keys_are_close_to_mitsubas_own_rendering(r, key):
+    truth, traced = r.reference_frames(T_S, 128), r.traced(T_S)
     assert np.isfinite(key).all() and key.min() >= 0 and key.max() < 4
     error = key - truth
     assert np.abs(error).mean() < NOISE
     assert abs(error.mean()) < 0.002
-    smooth, plain = (gaussian_filter(e, (0, 2, 2))[~traced] for e in (error, r.background - truth))
-    assert np.abs(smooth).mean() < 0.8 * np.abs(plain).mean()  # relighting removes the error above the noise
+    smooth, plain = (gaussian_filter(e, (0, 3, 3))[~traced] for e in (error, r.background - truth))
+    assert np.abs(smooth).mean() < 0.65 * np.abs(plain).mean()  # relighting removes the error above the noise
     assert np.abs(smooth).max() < 0.03
 
 
@@ -80,10 +83,10 @@ def test_masks_and_depths_belong_together(r):
     assert (r.traced(T_S) | ~mask).all()
 
 
-def test_images_move_as_the_geometry(r):
+def test_images_move_as_the_geometry(r, key):
     """Warping one key by depth and pose gives another key: sides, direction of motion and textures all agree."""
-    t0, t1 = 0.004, 0.012
-    first, second, mask, depth = r.keys(t0)[1], r.keys(t1)[1], r.object_masks(t0)[1], r.depths(t0)[1]
+    t0, t1 = 0.004, T_S
+    first, second, mask, depth = r.keys(t0)[1], key[1], r.object_masks(t0)[1], r.depths(t0)[1]
     camera = r.cameras[1]
     rows, columns = np.nonzero(mask)
     points = camera.unproject(np.stack([columns + 0.5, rows + 0.5], 1), depth[mask].astype(np.float64))
@@ -99,30 +102,34 @@ def test_images_move_as_the_geometry(r):
 
 
 @one_world
-def test_a_key_depends_on_the_seed_and_the_time_alone(r):
-    together = r
-    together.keys(0.002)  # earlier renderings and other views have no influence
-    alone = MultiViewRenderer(r.world, together.cameras[1:], seed=0, spp=SPP, background_spp=256)
+def test_a_key_depends_on_the_seed_and_the_time_alone(r, key):
+    r.keys(0.002)  # earlier renderings and other views have no influence
+    alone = MultiViewRenderer(r.world, r.cameras[1:], seed=0, spp=SPP, background_spp=BACKGROUND_SPP)
     mask = alone.object_masks(T_S)[0]
-    assert alone.background[0].tobytes() == together.background[1].tobytes()
-    assert alone.keys(T_S)[0][mask].tobytes() == together.keys(T_S)[1][mask].tobytes()
-    pixels = np.arange(WIDTH * HEIGHT)
-    first, again, other = (
-        make_tracer(together._scene, together.cameras, seed).trace(pixels, SPP, 0, False) for seed in (0, 0, 1)
-    )
-    assert first.tobytes() == again.tobytes() != other.tobytes()
-    assert abs(first.mean() - other.mean()) < 0.01
+    assert alone.background[0].tobytes() == r.background[1].tobytes()
+    assert alone.keys(T_S)[0][mask].tobytes() == key[1][mask].tobytes()
+    other = make_tracer(r._scene, r.cameras, 1).trace(np.arange(r.background.size), SPP, 0, False) * r.world.exposure
+    first = r.static.first.reshape(-1, 3)
+    assert not np.array_equal(first, other) and abs(first.mean() - other.mean()) < 0.01
 
 
 @one_world
-def test_colour_is_the_same_image(r):
-    gray = r
-    colour = MultiViewRenderer(r.world, gray.cameras[1:], seed=0, spp=SPP, background_spp=256, color=True)
+def test_a_renderer_continues_from_the_background_of_another(r):
+    plan, static = KeyPlan(400, 20_000, 0.05, (20, 4, 2)), StaticViews.from_arrays(r.static.arrays())
+    second = MultiViewRenderer(r.world, r.cameras, seed=0, spp=SPP, background_spp=BACKGROUND_SPP, static=static)
+    for tick in (220, 222):
+        a, b = r.key_arrays(tick, plan), second.key_arrays(tick, plan)
+        assert a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
+
+
+@one_world
+def test_colour_is_the_same_image(r, key):
+    colour = MultiViewRenderer(r.world, r.cameras[1:], seed=0, spp=SPP, background_spp=BACKGROUND_SPP, color=True)
     rgb = colour.keys(T_S)
     assert rgb.shape == (1, HEIGHT, WIDTH, 3)
-    np.testing.assert_allclose(gray_of(rgb[0]), gray.keys(T_S)[1], atol=2e-3)  # smoothing at other pixels
-    mask = gray.object_masks(T_S)[1]
-    np.testing.assert_allclose(gray_of(rgb[0])[mask], gray.keys(T_S)[1][mask], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(gray_of(rgb[0]), key[1], atol=2e-3)  # smoothing at other pixels
+    mask = r.object_masks(T_S)[1]
+    np.testing.assert_allclose(gray_of(rgb[0])[mask], key[1][mask], rtol=1e-5, atol=1e-6)
     assert np.abs(rgb[..., 0] - rgb[..., 2]).mean() > 0.01
 
 
@@ -140,11 +147,40 @@ def test_speeds_are_those_of_warped_points_and_shadows(r):
 
 
 @one_world
-def test_whole_frames_are_the_exact_way(r):
+def test_whole_frames_are_the_exact_way(r, full):
     exact = MultiViewRenderer(r.world, r.cameras[1:], seed=0, spp=SPP, background_spp=SPP, whole_frames=True)
-    assert np.array_equal(exact.keys(T_S)[0], r.crn_frames(T_S)[1])
-    arrays = exact.key_arrays(200, KeyPlan(400, 20_000, 0.5, (1,)))
-    assert np.array_equal(arrays["values0"], exact.keys(0.01).ravel()) and (arrays["given0"] == 255).all()
+    arrays = exact.key_arrays(226, KeyPlan(400, 20_000, 0.5, (1,)))
+    assert np.array_equal(arrays["values0"], full[1].ravel()) and (arrays["given0"] == 255).all()
+
+
+@one_world
+def test_fine_keys_give_fast_pixels_and_the_rest_is_close(r, tmp_path):
+    """Dense keys from a plan against images rendered at their ticks: small errors, and none where keys are given."""
+    plan, store, shares = KeyPlan(40, 20_000, 0.05, (20, 4, 2, 1)), KeyStore(tmp_path), []
+    store.set_static(r.static)
+    for tick in (0, 4, 8, 10, 11, 12, 14, 16, 20, 40):  # all that the three below need; the disc turns steadily
+        store.put(tick, r.key_arrays(tick, plan))
+    clip = store.instants(1, plan)
+    for tick in (11, 14, 16):
+        exact, traced = r.keys(tick / 20_000)[1], r.traced(tick / 20_000)[1]
+        given, values = store.given(tick, 1)
+        shares.append(given.sum() / traced.sum())
+        assert (traced | ~given).all()
+        assert np.array_equal(clip.keys[tick][given], exact[given]) and np.array_equal(values, exact[given])
+        error = np.abs(clip.keys[tick] - exact) / np.maximum(exact, 0.02)
+        assert error[traced].mean() < 0.004 and error[~traced].mean() < 0.001
+    assert min(shares) < 0.4 and max(shares) > 0.9  # fine ticks give the rim, coarser ones more
+
+
+@one_world
+def test_ticks_with_fast_motion_are_rendered_inside_the_tick(r):
+    """At 500 Hz the disc turns by 4 px a tick: the rendered mean is nearer to a fine mean than that of two keys is."""
+    arrays = r.key_arrays(5, KeyPlan(10, 500, 0.2, (1,), sub_ticks=4))
+    given = np.flatnonzero(np.unpackbits(arrays["mean_given0"], count=WIDTH * HEIGHT))
+    truth = np.mean([r._traced_at(given, (5 + (k + 0.5) / 6) / 500) for k in range(6)], axis=0)
+    two = (r._traced_at(given, 5 / 500) + r._traced_at(given, 6 / 500)) / 2
+    assert len(given) > 0.1 * WIDTH * HEIGHT
+    assert np.abs(arrays["mean_values0"] - truth).mean() < 0.35 * np.abs(two - truth).mean()
 
 
 # ---------------------------------------------------------------- surfaces that deform
@@ -209,67 +245,3 @@ def test_cameras_of_two_sizes_are_refused():
 def test_a_reference_takes_any_seed(r, monkeypatch):
     monkeypatch.setattr(r, "_seed", 2**100)
     assert np.isfinite(r.reference_frames(T_S, 1)).all()
-
-
-@pytest.mark.parametrize("sigma", [0.2, 0.5, 0.8])
-def test_a_blurred_pixels_footprint_is_a_box_and_a_gaussian(sigma):
-    if load_mitsuba().variant().startswith("scalar"):
-        pytest.skip("the scalar variant has no blur")
-    from spike4dgs.generators.rendering.wavefront import footprint_quantiles
-
-    x = footprint_quantiles(sigma)
-    assert x == pytest.approx(-x[::-1], abs=1e-6) and (np.diff(x) > 0).all()
-    middle = (x[1:] + x[:-1]) / 2
-    assert np.mean(middle**2) == pytest.approx(1 / 12 + sigma**2, rel=2e-3)
-    inside = np.random.default_rng(0).uniform(-0.5, 0.5, 400_000)
-    for edge in (-0.7, 0.0, 0.4, 1.1):  # the response to an edge, by another way
-        assert np.mean(middle < edge) == pytest.approx(norm.cdf((edge - inside) / sigma).mean(), abs=2e-3)
-
-
-def test_a_blur_of_a_number_that_rounded_to_one_is_the_last_quantile():
-    if load_mitsuba().variant().startswith("scalar"):
-        pytest.skip("the scalar variant has no blur")
-    import mitsuba as mi
-
-    from spike4dgs.generators.rendering.wavefront import Views, footprint_quantiles
-
-    views = Views.of(cameras(world("car"), 8, 5, (4,)), 0.5)
-    assert np.array(views._blurred(mi.Float(1.0)))[0] == pytest.approx(0.5 + footprint_quantiles(0.5)[-1])
-
-
-def test_a_blur_is_that_of_the_radiance_and_keeps_its_sum():
-    """Against a rendering with four times the pixels along each side, filtered by SciPy."""
-    if load_mitsuba().variant().startswith("scalar"):
-        pytest.skip("the scalar variant has no blur")
-    sigma, fine = 0.6, 4
-    w = world("turntable")
-
-    def whole(width, height, spp, **options):
-        r = MultiViewRenderer(w, cameras(w, width, height, (4,)), seed=0, spp=spp, background_spp=spp, **options)
-        return r.crn_frames(0.0)[0].astype(np.float64)
-
-    blurred, large = whole(64, 40, 256, psf_px=sigma), whole(64 * fine, 40 * fine, 32)
-    sharp, expected = (
-        image.reshape(40, fine, 64, fine).mean((1, 3))
-        for image in (large, gaussian_filter(large, sigma * fine, mode="nearest"))
-    )
-    inside = np.s_[3:-3, 3:-3]  # beyond the image's edge only the renderer sees
-    assert np.abs(sharp - expected)[inside].mean() > 0.01
-    assert np.abs(blurred - expected)[inside].mean() < 0.004  # the noise of both
-    assert blurred[inside].mean() == pytest.approx(expected[inside].mean(), rel=2e-3)
-
-
-def test_rays_go_through_the_lens():
-    lens = (-0.25, 0.05, 0.002, -0.003, 0.01)
-    rig = [cameras(world("car"), 64, 40, (4,))[0], replace(cameras(world("car"), 64, 40, (0,))[0], distortion=lens)]
-    renderer = MultiViewRenderer(world("car"), rig, seed=0, spp=1, background_spp=1)
-    if load_mitsuba().variant().startswith("scalar"):
-        pytest.skip("the scalar variant has no lenses")
-    import mitsuba as mi
-
-    v, u = np.mgrid[:40:3, :64:3].reshape(2, -1) + 0.5
-    for view, camera in enumerate(rig):
-        ray = renderer._tracer._views._ray(mi.UInt32(np.full(len(u), view)), mi.Float(u), mi.Float(v))
-        points = camera.unproject(np.stack([u, v], 1), np.ones(len(u))) - camera.center
-        expected = points / np.linalg.norm(points, axis=1, keepdims=True)
-        assert np.abs(np.array(ray.d).T - expected).max() < 1e-6

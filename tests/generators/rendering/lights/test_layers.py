@@ -9,6 +9,7 @@ import pytest
 from built_worlds import built
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.images import gray
 from spike4dgs.generators.make_dataset import SceneSettings, make_dataset
 from spike4dgs.generators.rendering.image_motion import KeyPlan
 from spike4dgs.generators.rendering.lights.layers import FlashStore, key_store, path_renderer
@@ -26,19 +27,19 @@ def test_a_flash_is_rendered_as_by_mitsubas_own_loop():
     layered = path_renderer(world, views, seed=0, spp=32, background_spp=32)
     assert world.flash and 0.5 < world.flash.brightness(T_S) < 1
     now = MultiViewRenderer(world.at_brightness(T_S), views, seed=0, spp=32, background_spp=32)
-    truth, key, steady = now.reference_frames(T_S, 128), layered.keys(T_S), layered._layers[0].keys(T_S)
+    truth, key = now.reference_frames(T_S, 128), layered.keys(T_S)
+    background, _ = layered.static_at(np.arange(2 * 64 * 40))
+    backgrounds = np.stack([part.static.background for part in layered._layers])
+    assert np.array_equal(background, backgrounds.reshape(-1, 3))
+    arrays = layered.key_arrays(190, KeyPlan(400, 20_000, 0.5, (10,)))  # of the same time
+    assert set(arrays) == {"given0", "values0", "given1", "values1"}
+    steady, flashing = images = gray(backgrounds)
+    for v, image in enumerate(images):
+        image.ravel()[np.unpackbits(arrays[f"given{v}"]).astype(bool)] = arrays[f"values{v}"]
+    np.testing.assert_allclose(key, steady + world.flash.brightness(T_S) * flashing, rtol=1e-5)
     assert abs((key - truth).mean()) < 0.002 and abs((key - truth)[layered.moving_masks(T_S)].mean()) < 0.01
     lit = np.abs(steady - truth) > 0.05
     assert 0.1 < lit.mean() < 0.8 and np.abs(key - truth)[lit].mean() < 0.2 * np.abs(steady - truth)[lit].mean()
-
-    background, _ = layered.static_at(np.arange(2 * 64 * 40))
-    assert np.array_equal(
-        background, np.concatenate([part.static.background.reshape(-1, 3) for part in layered._layers])
-    )
-    arrays = layered.key_arrays(190, KeyPlan(400, 20_000, 0.5, (10,)))
-    assert set(arrays) == {"given0", "values0", "given1", "values1"}
-    given = np.unpackbits(arrays["given1"]).astype(bool)
-    assert np.array_equal(layered._layers[1].keys(T_S).ravel()[given], arrays["values1"])
 
 
 def test_radiance_between_keys_has_the_brightness_of_each_tick(tmp_path):
@@ -47,14 +48,8 @@ def test_radiance_between_keys_has_the_brightness_of_each_tick(tmp_path):
     light = np.float32([[[[0.2] * 3]], [[[0.5] * 3]]])  # one view of one pixel
     store.set_static(StaticViews(light, light))
     for tick in plan.ticks:
-        store.put(
-            tick,
-            {
-                f"{kind}{v}": np.zeros(1 if kind == "given" else 0, np.uint8)
-                for kind in ("given", "values")
-                for v in (0, 1)
-            },
-        )
+        given, values = np.zeros(1, np.uint8), np.zeros(0, np.float32)
+        store.put(tick, {"given0": given, "given1": given, "values0": values, "values1": values})
     expected = [0.2 + 0.5 * flash.brightness(tick / 20_000) for tick in range(41)]
     clip, means = store.instants(0, plan), store.view(0, plan)
     assert clip.ticks == list(range(41)) and means.means and len(means.keys) == 40

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from dataclasses import replace
 
 import numpy as np
@@ -23,13 +22,12 @@ MOVING = Physics(array_motion=2.0, array_rotation=200.0)
 
 
 @pytest.fixture(scope="module")
-def r():
+def r() -> MovingArrayRenderer:
     world = built("turntable")
     path = array_path(world.rig, MOVING, [0])
-    yield MovingArrayRenderer(
+    return MovingArrayRenderer(
         world, cameras(world, 64, 40, (1, 4)), path=path, seed=0, spp=32, background_spp=128, color=False
     )
-    gc.collect()
 
 
 def test_a_key_is_mitsubas_own_rendering_by_cameras_where_they_are_then(r):
@@ -37,7 +35,7 @@ def test_a_key_is_mitsubas_own_rendering_by_cameras_where_they_are_then(r):
     still = MultiViewRenderer(r.world, r.path.posed(r.cameras, T_S), seed=5, spp=32, background_spp=32)
     truth = still.reference_frames(T_S, 128)
     assert abs((key - truth).mean()) < 0.002 and np.abs(key - truth).mean() < 0.03
-    fixed = MultiViewRenderer(r.world, r.cameras, seed=5, spp=32, background_spp=32).reference_frames(T_S, 128)
+    fixed = MultiViewRenderer(r.world, r.cameras, seed=5, spp=32, background_spp=32).reference_frames(T_S, 32)
     assert np.abs(fixed - truth).mean() > 3 * np.abs(key - truth).mean()
 
 
