@@ -60,6 +60,11 @@ class FitJob:
     key: str
     light: Light | None = None  # what changes in the scene's light
 
+    @property
+    def parts(self) -> float:
+        """The clip's length in parts of 20 ms that steps follow; a publication's are for the whole clip."""
+        return 1.0 if self.request.budget.published else self.extent.parts
+
 
 @dataclass(frozen=True)
 class Algorithm:
@@ -210,7 +215,8 @@ class RecipeMethod(Shown):
 
             images, settings, pace = at_pace(scene.id, maker, settings, make)
         key = sha256_json([scene.revision, self.params, request.budget.label, request.seed])
-        extent = replace(measure(start, scene), images=wanted_images(scene.n_ticks, settings["images"]), pace=pace)
+        count = len(images.ticks) if recorded else wanted_images(scene.n_ticks, settings["images"])
+        extent = replace(measure(start, scene), images=count, pace=pace)
         return algorithm.fit(FitJob(scene, start, images, extent, settings, request, key, light))
 
     def _static(self, settings: Mapping[str, Any]) -> tuple[Algorithm, Mapping[str, Any]]:
@@ -266,7 +272,7 @@ def fit_gaussians(
     initial = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
     first = motion.initialize(from_points(points, values, **initial, device=request.device), job.training_images)
     loss = supervise(job.settings["supervision"], job.scene).to(request.device)
-    own: Any = {"scale": job.extent.scale, "seed": request.seed, "path": start.path}
+    own: Any = {"scale": job.extent.scale, "seed": request.seed, "path": start.path, "parts": job.parts}
     trainer = Trainer(job.training_images, first, motion, loss, settings, density, **own)
     trainer.run(request.progress, request.checkpoint, job.key)
     return FittedModel(

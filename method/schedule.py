@@ -1,7 +1,8 @@
 """The schedule of a fit: stages of steps, each on a part of the clip that opens up while the stage goes on.
 
-A long clip may be fitted in pieces, each with Gaussians of its own: the middle one first, from the static stage; then,
-outwards, every other one from where its neighbour ends.
+Step counts are for 20 ms. A longer clip has `piece_steps` more for each further 20 ms, whatever the motion. It may be
+fitted in pieces, each with Gaussians of its own: the middle one first, from the static stage; then, outwards, every
+other one from where its neighbour ends. A motion without pieces fits the whole clip in one longer stage.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ class TrainerSettings(Settings):
     # Steps. One step renders several views at one time, where 4DGS takes one image: a step of four views is 4 there.
     coarse_steps: int = 300  # static stage (4DGS: 3000 single images)
     fine_steps: int = 1200  # deforming stage (4DGS: 14000 single images)
-    piece_steps: int = 800  # the same of each further piece of a long clip, where the motion model has pieces
+    piece_steps: int = 800  # more of them for each further 20 ms of a long clip
     views_per_step: int = 4  # they share one time and one deformation; of 8 views only half as many steps fit the time
     ramp: float = 0.3  # share of the fine stage in which the times open up from the middle to the whole clip
-    coarse_share: float = 0.2  # middle share of the clip (or its middle piece) that a moving scene's coarse stage sees
+    coarse_share: float = 0.2  # share of the middle 20 ms of the clip that a moving scene's coarse stage sees
 
     # Poses of the training cameras.
     refine_poses: bool = False  # fit them too; for initialisations that estimated them
@@ -121,27 +122,31 @@ class Stage:
         return (t - self.span[0]) / (self.span[1] - self.span[0])
 
 
-def stages(settings: TrainerSettings, moves: bool, rests_first: bool = True, pieces: int = 1) -> list[Stage]:
+def stages(
+    settings: TrainerSettings, moves: bool, rests_first: bool = True, pieces: int = 1, parts: float = 1.0
+) -> list[Stage]:
     """Return the static stage, followed by deforming ones where the motion model moves; or one that deforms throughout.
 
-    A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians. `pieces` is odd. Raises
-    UserError where a background is to be frozen after a static stage that there is not.
+    A moving scene begins with the middle of the clip, which gives sharp canonical Gaussians. `pieces` is odd, and about
+    as many as the clip has `parts` of 20 ms, or 1. Raises UserError where a background is to be frozen after a static
+    stage that there is not.
     """
     s = settings
-    share, middle = s.coarse_share / pieces, pieces // 2
+    share, middle = s.coarse_share / (pieces if pieces > 1 else parts), pieces // 2
     center = (0.5 - share / 2, 0.5 + share / 2)
+    further = round((parts - 1) * s.piece_steps) if pieces == 1 else 0
     if not moves:
-        return [Stage(0, s.coarse_steps, deforms=False)]
+        return [Stage(0, s.coarse_steps + further, deforms=False)]
     if not rests_first:
         if s.freeze_background:
             expected = "trainer.freeze_background false, as the motion has no static stage"
             raise problem("settings", expected, "true", "leave it out, or choose another motion")
-        return [Stage(0, s.coarse_steps + s.fine_steps, deforms=True, begin=center)]
+        return [Stage(0, s.coarse_steps + s.fine_steps + further, deforms=True, begin=center)]
     plan = [Stage(0, s.coarse_steps, deforms=False, span=center, begin=center)]
     for piece in sorted(range(pieces), key=lambda p: abs(p - middle)):
         first, low, high = plan[-1].first + plan[-1].steps, piece / pieces, (piece + 1) / pieces
         if piece == middle:
-            plan.append(Stage(first, s.fine_steps, True, (low, high), center, piece))
+            plan.append(Stage(first, s.fine_steps + further, True, (low, high), center, piece))
             continue
         begin, neighbour = ((low, low + share), piece - 1) if piece > middle else ((high - share, high), piece + 1)
         plan.append(Stage(first, s.piece_steps, True, (low, high), begin, piece, neighbour))

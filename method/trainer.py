@@ -63,6 +63,7 @@ class Trainer:
         scale: float,
         seed: int,
         path: ArrayPath | None = None,
+        parts: float = 1.0,
     ) -> None:
         if settings.refine_poses and (settings.freeze_background or images.spans is not None):
             expected = "either trainer.refine_poses, or trainer.freeze_background and images of known spans"
@@ -74,9 +75,8 @@ class Trainer:
         self.training_images, self.motion, self.supervision = images, motion, supervision
         self.settings, self.density, self.scale, self.seed, self.path = settings, density, scale, seed, path
         motion.pixel_filter = settings.pixel_filter
-        self.plan = stages(settings, motion.moves, motion.rests_first, motion.pieces)
-        self.total = sum(s.steps for s in self.plan)
-        self.step = 0
+        self.plan = stages(settings, motion.moves, motion.rests_first, motion.pieces, parts)
+        self.step, self.total = 0, sum(s.steps for s in self.plan)
         gaussians = with_layers(gaussians, images)
         self.gaussians = gaussians.trainable()
         self.ended: dict[int, Gaussians] = {}  # the pieces of the clip that are fitted

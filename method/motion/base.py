@@ -17,6 +17,9 @@ from spike4dgs.method.splat import Splats, Views
 from spike4dgs.method.splat.types import CUSTOMARY, PixelFilter
 from spike4dgs.method.training_views.training_images import TrainingImages
 
+PART_TICKS = 400  # 20 ms at 20 kHz, for which step counts are
+PART_IMAGES = 20  # at least about as many times of a view in each part of a clip
+
 
 @dataclass(frozen=True, eq=False)
 class Extent:
@@ -29,6 +32,14 @@ class Extent:
     width: int  # px of a view
     images: float = math.inf  # of a view over the clip, about; a saved model has no use for it
     pace: float = 1.0  # times that motion is faster than about a pixel from image to image; nor for this
+
+    @property
+    def parts(self) -> float:
+        """The clip's length in parts of 20 ms, at least 1. Steps follow it, and pieces where a motion has some.
+
+        Parts are longer where images are too far apart for that, and as much shorter where motion is faster.
+        """
+        return max(1.0, min(self.n_ticks * self.pace / PART_TICKS, self.images / PART_IMAGES))
 
 
 class Motion(nn.Module):

@@ -21,8 +21,6 @@ from spike4dgs.method.motion.polynomial import PolynomialMotion, PolynomialSetti
 from spike4dgs.method.training_views.training_images import TrainingImages
 from spike4dgs.method.training_views.velocities import velocities_at
 
-PIECE_TICKS = 400  # 20 ms at 20 kHz
-PIECE_IMAGES = 20  # at least about as many times of a view in each
 FLOW = 0.05  # of a piece: the optical flow of first velocities looks as far to both sides
 
 
@@ -45,13 +43,11 @@ class Paths(PolynomialMotion):
 
     @property
     def pieces(self) -> int:
-        """About 20 ms each, what a cubic can follow, or longer where images are too far apart for that.
+        """One for each part of the clip, about, as a cubic can follow 20 ms: the next odd number, or the next above.
 
-        The cost of rendering does not grow with the clip. Where motion is faster, pieces are at least as much shorter.
+        The cost of rendering does not grow with the clip.
         """
-        e = self.extent
-        count = min(e.n_ticks * e.pace / PIECE_TICKS, e.images / PIECE_IMAGES)
-        return 2 * (math.ceil if e.pace > 1 else round)((count - 1) / 2) + 1
+        return 2 * (math.ceil if self.extent.pace > 1 else round)((self.extent.parts - 1) / 2) + 1
 
     @property
     def coherence(self) -> float:

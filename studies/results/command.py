@@ -17,7 +17,7 @@ from spike4dgs.studies.results.pages import outdated, pages_of, write_pages
 from spike4dgs.studies.results.plan import ABLATIONS, PLAN, TRIAL, Cell, cells_of
 from spike4dgs.studies.results.records import Record, read_records
 from spike4dgs.studies.results.sweep import SweepSettings, sweep
-from spike4dgs.studies.results.tables import conditions, modality, parts, realistic, steps
+from spike4dgs.studies.results.tables import conditions, modality, paper, parts, realistic, steps
 from spike4dgs.studies.results.tables.images import TABLE6
 
 EVERY_GROUP = (
@@ -31,6 +31,7 @@ EVERY_GROUP = (
     conditions.CEILINGS,
     modality.GROUP,
     modality.NOISY,
+    paper.GROUP,
     parts.GROUP,
     realistic.GROUP,
     *steps.GROUPS,
@@ -44,8 +45,8 @@ class Choice:
     Args:
         only: Groups of the plan: table1 to table4, table6, table7, unposed (table 1, poses estimated), views-3 to
             views-8 (table 5), conditions, conditions-refined, conditions-views-3 and -5, content, ceilings (of
-            conditions and content), modality, modality-noisy, parts, small, steps-quick, steps-standard, steps-16, or
-            trial (two tiny scenes). All but trial if left out.
+            conditions and content), modality, modality-noisy, paper, parts, small, steps-quick, steps-standard,
+            steps-16, or trial (two tiny scenes). All but trial if left out.
         rows: Names of rows; all rows of the groups if left out.
         scenes_of: Folder of the scenes. Planned scenes that it does not contain are skipped.
         out: Folder for predictions and checkpoints.

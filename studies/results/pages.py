@@ -17,6 +17,7 @@ from spike4dgs.studies.results.tables.conditions import conditions_block, conten
 from spike4dgs.studies.results.tables.covisible import covisible_block
 from spike4dgs.studies.results.tables.images import images_block
 from spike4dgs.studies.results.tables.modality import modality_block, noisy_block
+from spike4dgs.studies.results.tables.paper import paper_block
 from spike4dgs.studies.results.tables.parts import own_scenes_block, parts_block, self_calibrated_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
 from spike4dgs.studies.results.tables.realistic import cameras_block, realistic_block
@@ -36,6 +37,7 @@ BLOCKS: dict[str, Callable[[Sequence[Record]], list[str]]] = {  # by their names
     "nine-scenes": lambda records: table_block(NINE, records),
     "own-scenes": own_scenes_block,
     "pairs": pairs_block,
+    "paper": paper_block,
     "parts": parts_block,
     "published": lambda records: published_block(TABLE1, 1, records),
     "realistic": realistic_block,

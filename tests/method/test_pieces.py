@@ -14,13 +14,13 @@ from toy_fits import checkpoints, images, silent, surfaces
 from toy_fits import trainer as toy_trainer
 from toy_world import ToyWorld
 
-from spike4dgs.benchmark.method import FitRequest, Recipe
+from spike4dgs.benchmark.method import Budget, FitRequest, Recipe
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.images.training import ImageSettings, wanted_images
 from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.models.saved_model import load_model
-from spike4dgs.method.motion import paths as paths_module
+from spike4dgs.method.motion import base as base_module
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.paths import Paths, PathSettings
 from spike4dgs.method.motion.table import MOTIONS
@@ -65,6 +65,46 @@ def test_stages_go_outwards_and_each_begins_where_its_neighbour_ends() -> None:
             assert np.abs(times[:5] - border).max() <= 48 and np.abs(times - border).max() > 180
     at = {round(m.within(a), 9) for m in moving for a in m.span}
     assert at == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("n_ticks", [1, 200, 400, 600, 1200, 2000])
+def test_a_motion_without_pieces_has_the_steps_of_pieces(n_ticks: int) -> None:
+    """A deforming stage, a static scene, and a motion that has no static stage."""
+    s = TrainerSettings(coarse_steps=100, fine_steps=200, piece_steps=150, coarse_share=0.2)
+    motion = paths(n_ticks)
+    pieces, parts = motion.pieces, motion.extent.parts
+    more = 150 * (max(n_ticks, 400) / 400 - 1)
+    rest, moving = stages(s, moves=True, parts=parts)
+    assert (rest.steps, moving.steps, moving.span) == (100, 200 + more, (0.0, 1.0))
+    assert np.ptp(rest.span) * max(n_ticks, 400) == pytest.approx(0.2 * 400), "what a piece's static stage sees"
+    (floor,), (throughout,) = (stages(s, m, rests, parts=parts) for m, rests in ((False, True), (True, False)))
+    assert (floor.steps, throughout.steps) == (100 + more, 300 + more)
+    own = stages(s, moves=True, pieces=pieces, parts=parts)
+    assert pieces in (1, n_ticks // 400) and sum(stage.steps for stage in own) == 300 + more
+
+
+@pytest.mark.parametrize(
+    ("motion", "budget", "total"),
+    [("hexplane", 1.0, 10 + 20 + 2 * 15), ("paths", 1.0, 10 + 20 + 2 * 15), ("static", 2.0, 20 + 2 * 30)]
+    + [("hexplane", None, 750 + 3750)],
+)
+def test_steps_of_a_fit_follow_the_clip(motion: str, budget: float | None, total: int) -> None:
+    """60 ms; a publication's steps are for the whole clip."""
+
+    class Begun(Exception):
+        """The fit's first step is done."""
+
+    def told(done: int, of: int, note: str = "") -> None:
+        if of > 1:
+            raise Begun(of)
+
+    true = Initialization(lambda request: surfaces(request.scene, request.seed, WORLD))
+    parts = Parts({"short": images}, {"true": true}, MOTIONS, SUPERVISIONS)
+    steps = {"trainer.coarse_steps": 10, "trainer.fine_steps": 20, "trainer.piece_steps": 15}
+    recipe = Recipe("test", "short", "true", motion, "pixel", {**steps, "images.time_spacing_ticks": 20})
+    request = FitRequest(Budget(budget) if budget else Budget(published=True), progress=told)
+    with pytest.raises(Begun, match=f"^{total}$"):
+        RecipeMethod(recipe, parts).fit(WORLD.training, request)
 
 
 @pytest.mark.parametrize("forward", [True, False])
@@ -166,7 +206,7 @@ def test_pieces_follow_what_one_path_through_a_long_clip_does_not(monkeypatch: p
         return RecipeMethod(recipe, parts).fit(WORLD.training, FitRequest())  # type: ignore[return-value]
 
     pieces = fitted(150)
-    monkeypatch.setattr(paths_module, "PIECE_TICKS", 10_000)
+    monkeypatch.setattr(base_module, "PART_TICKS", 10_000)
     whole = fitted(390)
     assert (len(pieces.pieces), len(whole.pieces)) == (3, 1)
     assert WORLD.psnr(pieces, moving=True) > WORLD.psnr(whole, moving=True) + 2

@@ -16,7 +16,7 @@ from spike4dgs.baselines.radiance_field.march import camera_rays
 from spike4dgs.baselines.radiance_field.model import RadianceModel
 from spike4dgs.baselines.radiance_field.occupancy import OccupancySettings
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.method import FitRequest, Progress
+from spike4dgs.benchmark.method import Budget, FitRequest, Progress
 from spike4dgs.method.fit import FitJob
 from spike4dgs.method.settings import override, scaled
 from spike4dgs.method.splat import Views
@@ -164,6 +164,14 @@ def test_another_seed_gives_another_field_and_another_fits_checkpoint_is_refused
     assert not torch.equal(tensors(other)["field.fine.value.weight"], uninterrupted()["field.fine.value.weight"])
     with pytest.raises(UserError, match="another fit's; delete it"):
         fit.Fitter(replace(short(silent, path, travel=0.0), key="that")).run()
+
+
+@pytest.mark.parametrize(("n_ticks", "budget", "steps"), [(400, 1.0, 30), (1000, 1.0, 60), (1000, None, 30)])
+def test_steps_follow_the_clip_but_not_a_publications(n_ticks: int, budget: float | None, steps: int) -> None:
+    """20 ms and 50 ms."""
+    one = job(replace(SHORT, steps=30))
+    request = replace(one.request, budget=Budget(budget) if budget else Budget(published=True))
+    assert fit.Fitter(replace(one, request=request, extent=replace(one.extent, n_ticks=n_ticks))).total == steps
 
 
 def test_every_parameter_learns() -> None:

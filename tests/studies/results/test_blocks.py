@@ -30,6 +30,8 @@ from spike4dgs.studies.results.tables.covisible import covisible_block
 from spike4dgs.studies.results.tables.images import TABLE6, images_block
 from spike4dgs.studies.results.tables.modality import GROUP as ON_SENSORS
 from spike4dgs.studies.results.tables.modality import NOISY, modality_block, noisy_block, plot_modality
+from spike4dgs.studies.results.tables.paper import GROUP as PAPER
+from spike4dgs.studies.results.tables.paper import paper_block
 from spike4dgs.studies.results.tables.parts import GROUP as PARTS
 from spike4dgs.studies.results.tables.parts import SWITCHES, own_scenes_block, parts_block, self_calibrated_block
 from spike4dgs.studies.results.tables.published import pairs_block, published_block, unposed_block, views_block
@@ -240,6 +242,7 @@ def test_every_block_says_that_there_is_nothing_yet_and_shows_what_there_is(name
         "covisible": TRACK_SMALL,
         "modality": ON_SENSORS,
         "modality-noisy": NOISY,
+        "paper": PAPER,
         "parts": PARTS,
         "realistic": TRACK_SMALL,
         "steps": STEPS[0],
@@ -567,6 +570,20 @@ def test_cameras_are_compared_on_the_same_worlds():
     lines = cameras_block(found)
     assert lines[2] == f"| `{OURS}` | 40.00 / 38.00 | 42.50 / 40.50 | +2.50 / +2.50 |"
     assert lines[3] == "" and "the same 2 worlds" in lines[4]
+
+
+def test_the_papers_size_beside_the_papers_times():
+    """Over the scenes that ours has; rows that lack one of these are left out."""
+    scenes = track_scenes("paper", ["car", "van", "bird"])
+    found = [record("tfp+4dgs", scene, 31.0, fit_seconds=1500.0, render_fps=10.0, quiet=False) for scene in scenes]
+    found += [record(OURS, scene, 40.0 + k, fit_seconds=120.0, render_fps=200.0) for k, scene in enumerate(scenes[:2])]
+    found += [record("spike4dgs", scenes[0], 39.0), record(OURS, scenes[2], 0.0, error="no weights", metrics={})]
+    lines = paper_block([r | {"peak_memory_mb": 2040.0} for r in found])
+    assert lines[2:4] == [
+        f"| `{OURS}` | 40.50 | 42.50 | 0.9700 | 0.050 | 120 | 0.10 | 200 | 5.00 | 2.0 |",
+        "| `tfp+4dgs` | 31.00 | 33.00 | 0.9700 | 0.050 | (1500) | (1.25) | (10) | (0.25) | 2.0 |",
+    ]
+    assert lines[4] == "" and lines[5].startswith("Means of 2 scenes: car-0-paper, van-0-paper.")
 
 
 def test_a_part_is_worth_what_its_absence_costs():
