@@ -10,6 +10,7 @@ from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.runs.record import COSTS
+from spike4dgs.benchmark.variants import world_of
 from spike4dgs.leaderboard.page.intervals import Comparison
 from spike4dgs.leaderboard.page.rows import Board, Row
 from spike4dgs.leaderboard.page.scores import ImageScores, rounded
@@ -55,6 +56,7 @@ def board_content(board: Board, identifier: str) -> dict[str, Any]:
             }
             for s in board.scenes
         ],
+        "worlds": [world_of(s) for s in board.scenes],
         "published": published_values(board),
         "rows": [_row(row, board.scenes) for row in board.rows],
     }

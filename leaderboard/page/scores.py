@@ -8,6 +8,7 @@ import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.metrics.table import METRICS
+from spike4dgs.benchmark.variants import world_of
 from spike4dgs.leaderboard.page.intervals import Comparison, compare
 from spike4dgs.leaderboard.page.rows import Board, Row
 
@@ -26,6 +27,7 @@ class ImageScores:
     images: list[list[str]]
     values: dict[int, list[Float64]]
     left_out: dict[int, str]
+    worlds: list[str]  # of each scene
 
 
 def rounded(value: float | None) -> float | None:
@@ -50,7 +52,7 @@ def image_scores(board: Board, metric: str) -> ImageScores:
         if lacking or not all(union):
             left_out[i] = f"no {METRICS[metric].title} of {lacking} images" if lacking else "no scores"
     values = {i: [] if i in left_out else _values(board.rows[i], board.scenes, union, metric) for i in scored}
-    return ImageScores(union, {i: v for i, v in values.items() if v}, left_out)
+    return ImageScores(union, {i: v for i, v in values.items() if v}, left_out, list(map(world_of, board.scenes)))
 
 
 def _scored(row: Row, scenes: list[str], metric: str) -> list[set[str]]:
@@ -81,4 +83,4 @@ def compare_rows(scores: ImageScores, metric: str) -> Comparison | None:
     """Return the comparison of the rows in `scores.values`, in their order; None where there is none to compare."""
     if not scores.values:
         return None
-    return compare(list(scores.values.values()), METRICS[metric].higher_is_better)
+    return compare(list(scores.values.values()), METRICS[metric].higher_is_better, scores.worlds)

@@ -28,12 +28,13 @@ from spike4dgs.benchmark.reports.error_map import ERROR_MAX, SCALES, error_color
 from spike4dgs.benchmark.runs.results import write_results
 from spike4dgs.leaderboard.page.content import board_content, details, page_metrics, score_content
 from spike4dgs.leaderboard.page.intervals import (
-    FEWEST_SCENES,
+    FEWEST_WORLDS,
     GRID,
     LEVEL,
     MOST_UNITS,
     REPLICATES,
     SEED,
+    joint_value,
     widened_values,
 )
 from spike4dgs.leaderboard.page.pictures import write_pictures
@@ -142,8 +143,9 @@ def facts(boards: Sequence[Board]) -> dict[str, Any]:
             "level": LEVEL,
             "replicates": REPLICATES,
             "seed": SEED,
-            "fewestScenes": FEWEST_SCENES,
+            "fewestWorlds": FEWEST_WORLDS,
             "grid": [round(float(v), 9) for v in GRID],
+            "joint": [joint_value(n) for n in range(max((len(b.rows) for b in boards), default=0) + 1)],
             "widened": [None, None, *(widened_values(n).tolist() for n in range(2, MOST_UNITS + 1))],
         },
         "errors": {"max": ERROR_MAX, "scales": SCALES, "colors": error_colors().tolist()},

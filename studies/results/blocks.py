@@ -22,7 +22,7 @@ _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM",
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
 _LEGEND = (
     "Ranks are by PSNR where things move; rows that the intervals cannot tell apart share ranks. The number after ± is "
-    "half of the 95 % interval of the paired difference over scenes, which holds for all rows of a block at once. "
+    "half of the 95 % interval of the paired difference over worlds, which holds for all rows of a block at once. "
     "Times in parentheses were measured while other programs ran."
 )
 
@@ -37,7 +37,7 @@ def table_block(group: Group, records: Sequence[Record]) -> list[str]:
         lines += [f"**{knowledge.capitalize()}**: {KNOWLEDGE[knowledge]}. Means of {len(group.scenes)} scenes.", ""]
         if ranking.rows:
             lines += [*markdown(_HEADS, _cells(ranking)), ""]
-        lines += _incomplete(rows, own)
+        lines += _incomplete(rows)
     return [*lines, _LEGEND, "", provenance(own, group)]
 
 
@@ -71,7 +71,7 @@ def lead_block(group: Group, records: Sequence[Record]) -> list[str]:
         return [NO_LEAD if own else NOTHING]
     intro = (
         f"Against the best row of others with equal knowledge, in the mean of {len(group.scenes)} scenes. After ± is "
-        "half of a 95 % interval of the paired difference over scenes:"
+        "half of a 95 % interval of the paired difference over worlds:"
     )
     return [intro, "", *sentences, "", provenance(own, group)]
 
@@ -210,14 +210,13 @@ def _lead_text(row: MeasuredRow, rivals: Sequence[MeasuredRow]) -> str:
     return ", and ".join(parts)
 
 
-def _incomplete(rows: Sequence[MeasuredRow], own: Iterable[Record]) -> list[str]:
+def _incomplete(rows: Sequence[MeasuredRow]) -> list[str]:
     """Return a paragraph about the rows that are not ranked."""
-    reasons = {r["row"]: r["error"] for r in own if r["error"] is not None}
     texts = []
     for row in rows:
         if not row.is_complete:
-            reason = f": {reasons[row.name]}" if row.name in reasons else ""
-            texts.append(f"`{row.name}` ({row.scenes_there} of {len(row.scenes)} scenes{reason})")
+            failed = (f"; {scene}, seed {seed}: {error}" for (scene, seed), error in row.failed.items())
+            texts.append(f"`{row.name}` ({row.scenes_there} of {len(row.scenes)} scenes{''.join(failed)})")
     return [f"Incomplete, not ranked: {', '.join(texts)}.", ""] if texts else []
 
 
@@ -236,6 +235,8 @@ def provenance(own: Sequence[Record], *groups: Group) -> str:
         f"budget{'s' * (len(budgets) > 1)} {', '.join(budgets)}",
         f"{len(measured)} of {planned} planned cells{_finite(own)}",
     ]
+    elsewhere = sum("equivalent" in r for r in measured)
+    facts += [f"{elsewhere} of them on scenes that differ from the release's by rounding"] if elsewhere else []
     small = [SMALL_NETWORK] if any(r["row"].startswith("spk2img") for r in own) else []
     return " ".join([f"{'; '.join(facts)}.", *_mixed_code(own), _tuning(own), *small])
 

@@ -1,20 +1,22 @@
 """Rows compared over scenes: means, ranks with ties, and intervals of paired differences.
 
-Intervals are those of the leaderboard's ranks (`leaderboard.page.intervals`): a paired bootstrap over scenes and seeds,
-widened for few scenes. Those of a table's rows hold together with 95 %; that of a lead is of one pair.
+Intervals are those of the leaderboard's ranks (`leaderboard.page.intervals`): a paired bootstrap over worlds, their
+variants and seeds, widened for few worlds. Those of a table's rows hold together with 95 %; that of a lead is of one
+pair.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import fmean
 
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.leaderboard.page.intervals import FEWEST_SCENES, Comparison, compare
+from spike4dgs.benchmark.variants import world_of
+from spike4dgs.leaderboard.page.intervals import FEWEST_WORLDS, Comparison, compare
 from spike4dgs.studies.results.records import Record
 
 RANKED_BY = "psnr_dynamic"  # where things move is what the cameras are for
@@ -23,11 +25,15 @@ BOTH = ("psnr", RANKED_BY)  # of the whole image, and where things move
 
 @dataclass(frozen=True)
 class MeasuredRow:
-    """The records of a row on some scenes. `seeds` are those that every scene has."""
+    """The records of a row on some scenes. `seeds` are those that every scene has.
+
+    A row with a cell that failed has no mean: without it, a row would gain by failing where it is bad.
+    """
 
     name: str
     scenes: tuple[str, ...]
     cells: Mapping[tuple[str, int], Record]  # by scene and seed, those with metrics
+    failed: Mapping[tuple[str, int], str] = field(default_factory=dict)  # why other cells have none
 
     @cached_property
     def seeds(self) -> tuple[int, ...]:
@@ -43,7 +49,7 @@ class MeasuredRow:
     @property
     def is_complete(self) -> bool:
         """Return whether some seed was measured on every scene, with the metric of the ranks."""
-        return bool(self.seeds) and self.values(RANKED_BY) is not None
+        return bool(self.seeds) and not self.failed and self.values(RANKED_BY) is not None
 
     def values(self, metric: str) -> list[Float64] | None:
         """Return for each scene a metric's values [1, seeds]; None where one is missing."""
@@ -91,10 +97,15 @@ class Ranking:
 def rows_of(names: Iterable[str], scenes: Sequence[str], records: Iterable[Record]) -> list[MeasuredRow]:
     """Return the rows with these names, those without any measured cell among them."""
     cells: dict[str, dict[tuple[str, int], Record]] = {name: {} for name in names}
+    failed: dict[str, dict[tuple[str, int], str]] = {name: {} for name in cells}
     for record in records:
-        if record["row"] in cells and record["scene"] in scenes and record["error"] is None:
-            cells[record["row"]][record["scene"], record["seed"]] = record
-    return [MeasuredRow(name, tuple(scenes), found) for name, found in cells.items()]
+        if record["row"] in cells and record["scene"] in scenes:
+            key, error = (record["scene"], record["seed"]), record["error"]
+            if error is None:
+                cells[record["row"]][key] = record
+            else:
+                failed[record["row"]][key] = error
+    return [MeasuredRow(name, tuple(scenes), found, failed[name]) for name, found in cells.items()]
 
 
 def differences(one: MeasuredRow, other: MeasuredRow, metric: str) -> list[float]:
@@ -155,10 +166,11 @@ def lead(row: MeasuredRow, rivals: Sequence[MeasuredRow], metric: str) -> Lead |
 
 def _compared(rows: Sequence[MeasuredRow], metric: str) -> Comparison:
     values = [row.values(metric) for row in rows]
-    found = compare([v for v in values if v is not None], higher_is_better=True)
-    if len(rows[0].scenes) >= FEWEST_SCENES:
+    worlds = list(map(world_of, rows[0].scenes))
+    found = compare([v for v in values if v is not None], higher_is_better=True, worlds=worlds)
+    if len(set(worlds)) >= FEWEST_WORLDS:
         return found
-    # Of fewer scenes, images would be drawn, and a record has one value a scene: nothing is known.
+    # Of fewer worlds, images would be drawn, and a record has one value a scene: nothing is known.
     n = len(rows)
     half_widths = np.where(np.eye(n) > 0, 0.0, np.inf)
     return replace(found, half_widths=half_widths, better=np.zeros((n, n), np.bool_))

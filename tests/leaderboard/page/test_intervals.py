@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -81,9 +82,11 @@ def test_of_a_single_image_nothing_is_told_and_a_method_alone_has_rank_one() -> 
 
 
 @pytest.mark.parametrize(
-    ("n_scenes", "effects"), [(5, (0.0,) * 6), (12, (2.0, 1.0, 1.0, 0.5, 0.0, 0.0))], ids=["equal", "some"]
+    ("n_scenes", "effects", "images"),
+    [(5, (0.0,) * 6, 8), (12, (2.0, 1.0, 1.0, 0.5, 0.0, 0.0), 8), (5, (0.0,) * 24, 1)],
+    ids=["equal", "some", "many"],
 )
-def test_intervals_cover_known_ranks(n_scenes: int, effects: tuple[float, ...]) -> None:
+def test_intervals_cover_known_ranks(n_scenes: int, effects: tuple[float, ...], images: int) -> None:
     """Methods differ by known effects, scenes and images add noise; the true ranks are in the intervals as promised."""
     truth, rng, trials = np.array(effects), np.random.default_rng(n_scenes), 150
     best = 1 + (truth[None] > truth[:, None]).sum(1)  # of methods that are equal any order is right:
@@ -92,7 +95,7 @@ def test_intervals_cover_known_ranks(n_scenes: int, effects: tuple[float, ...]) 
     for trial in range(trials):
         scenes = rng.normal(size=(1, n_scenes, 1)) * 3
         by_scene = rng.normal(size=(len(truth), n_scenes, 1)) * 0.5
-        noise = rng.normal(size=(len(truth), n_scenes, 8)) * 0.3
+        noise = rng.normal(size=(len(truth), n_scenes, images)) * 0.3
         found = compare(scored(truth[:, None, None] + scenes + by_scene + noise), True, replicates=400, seed=trial)
         # Each pair in the wrong order would put a true rank outside of some interval.
         covered += bool((found.best_ranks <= best).all() and (found.worst_ranks >= worst).all())
@@ -103,6 +106,34 @@ def test_intervals_cover_known_ranks(n_scenes: int, effects: tuple[float, ...]) 
         assert separated / trials > 0.2, "they also tell methods apart"
     else:
         assert covered / trials < 1, "and they are not so wide that they never err"
+
+
+def test_variants_of_a_world_are_not_independent_scenes() -> None:
+    """27 scenes of nine worlds, whose variants differ little: joint intervals hold, and are those of nine scenes."""
+    rng, worlds, trials, covered = np.random.default_rng(7), [str(s // 3) for s in range(27)], 100, 0
+    for trial in range(trials):
+        of_world = rng.normal(size=(6, 9, 1))
+        values = np.repeat(of_world, 3, axis=1) + rng.normal(size=(6, 27, 1)) * 0.5
+        covered += not compare(scored(values), True, worlds, replicates=400, seed=trial).better.any()
+    assert covered / trials > LEVEL - 3 * math.sqrt(LEVEL * (1 - LEVEL) / trials)
+    nine, same = (compare(scored(v), True, w) for v, w in ((of_world, None), (np.repeat(of_world, 3, axis=1), worlds)))
+    np.testing.assert_allclose(same.half_widths, nine.half_widths, rtol=0.1)
+    np.testing.assert_allclose(same.means, nine.means)
+
+
+def test_of_two_worlds_only_images_are_drawn() -> None:
+    """However many variants they have."""
+    values = np.random.default_rng(8).normal(size=(3, 6, 9))
+    two = compare(scored(values), True, list("aaabbb"))
+    draws = resampled_means(scored(values), False) - values.mean((1, 2))
+    assert two.half_widths == pytest.approx(intervals._half_widths(draws, 54))
+
+
+def test_all_pairs_hold_together() -> None:
+    pairs = {2: 1, 5: 10, 24: 276}
+    for methods, count in pairs.items():
+        one = NormalDist().inv_cdf(1 - (1 - LEVEL) / 2 / count)
+        assert intervals.joint_value(methods) == pytest.approx(one, rel=2e-4)
 
 
 def lowbias32(x: int) -> int:

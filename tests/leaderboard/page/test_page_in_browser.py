@@ -275,22 +275,23 @@ def better_of(page: Page, name: str, scenes: list[int]) -> Any:
     """What the page's own bootstrap says of a board."""
     code = (
         f"(() => {{ const {{page}} = Spike4DGS.app.current(); const b = page.boards.findIndex(b => b.id === {name!r});"
-        f"const values = Spike4DGS.intervals.nested(Spike4DGS.ready(`scores-${{b}}-psnr`), {scenes});"
-        "return Spike4DGS.intervals.compare(values, true, page.bootstrap).better })()"
+        f"const scenes = {scenes}; const worlds = scenes.map(s => page.boards[b].worlds[s]);"
+        "const values = Spike4DGS.intervals.nested(Spike4DGS.ready(`scores-${b}-psnr`), scenes);"
+        "return Spike4DGS.intervals.compare(values, worlds, true, page.bootstrap).better })()"
     )
     return np.array(page.value(code))
 
 
-@pytest.mark.parametrize("name", ["ideal", "quick-start", "seeds"])
+@pytest.mark.parametrize("name", ["ideal", "small", "quick-start", "seeds"])
 def test_the_pages_intervals_are_pythons(page: Page, committed: list[Board], name: str) -> None:
     go(page, f"t={name}")
     compared = seeds_board() if name == "seeds" else find_board(committed, name)
-    values = list(image_scores(compared, "psnr").values.values())
-    scenes = list(range(len(compared.scenes)))
-    np.testing.assert_array_equal(better_of(page, name, scenes), compare(values, True).better)
-    some = scenes[:-1]
-    expected = compare([[method[s] for s in some] for method in values], True).better
-    np.testing.assert_array_equal(better_of(page, name, some), expected)
+    scores = image_scores(compared, "psnr")
+    every = list(range(len(compared.scenes)))
+    for scenes in (every, every[:-1]):
+        values = [[method[s] for s in scenes] for method in scores.values.values()]
+        expected = compare(values, True, [scores.worlds[s] for s in scenes]).better
+        np.testing.assert_array_equal(better_of(page, name, scenes), expected)
 
 
 def test_ranks_follow_the_chosen_scenes(page: Page) -> None:

@@ -40,7 +40,8 @@ Spike4DGS.app = (() => {
       return { rows: [], better: [], leftOut: { ...scores.leftOut, ...why } };
     }
     const values = Spike4DGS.intervals.nested(scores, view.scenes);
-    const found = Spike4DGS.intervals.compare(values, page.index.get(view.metric).higher, page.bootstrap, fixed);
+    const worlds = view.scenes.map((s) => view.board.worlds[s]);
+    const found = Spike4DGS.intervals.compare(values, worlds, page.index.get(view.metric).higher, page.bootstrap, fixed);
     return { ...scores, better: found.better };
   }
 
@@ -114,7 +115,7 @@ Spike4DGS.app = (() => {
   function footer() {
     const empty = page.empty.map((t) => `${t.name} (${t.announced ? "announced" : "open"})`).join(", ");
     fill(byId("footer"),
-      el("p", {}, `Intervals: a paired bootstrap over scenes, images and seeds, ${page.bootstrap.replicates} replicates. Of less than ${page.bootstrap.fewestScenes} scenes only images and seeds are drawn, and the intervals are about these scenes. `,
+      el("p", {}, `Intervals: a paired bootstrap over worlds, images and seeds, ${page.bootstrap.replicates} replicates. Of less than ${page.bootstrap.fewestWorlds} worlds only images and seeds are drawn, and the intervals are about these scenes. `,
         "Fit time, images/s, memory and model size are what each entry claims."),
       empty && el("p", {}, `Tracks without entries: ${empty}.`),
       page.refused.length ? el("details", {}, el("summary", {}, `${plural(page.refused.length, "entry").replace("entrys", "entries")} not listed`),

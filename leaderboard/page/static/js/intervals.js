@@ -49,18 +49,25 @@ Spike4DGS.intervals = (() => {
     return table[i] + ((x - grid[i]) / (grid[i + 1] - grid[i])) * (table[i + 1] - table[i]);
   }
 
+  /* Return scores by world: the images of its scenes, one after the other. `worlds` has each scene's. */
+  const byWorld = (values, worlds) =>
+    values.map((method) => [...new Set(worlds)].map((world) => method.filter((_, s) => worlds[s] === world).flat()));
+
+  const meansOf = (values) => values.map((method) => average(method.map((scene) => average(scene.map(average)))));
+
   /* Return { means, better }: better[i][j] where method i is better than j beyond the interval of their difference. */
-  function compare(values, higher, settings, fixed = false) {
+  function compare(values, worlds, higher, settings, fixed = false) {
     const n = values.length;
-    const scenes = values[0].length;
-    const resampleScenes = !fixed && scenes >= settings.fewestScenes;
-    const means = values.map((method) => average(method.map((scene) => average(scene.map(average)))));
-    const draws = resampledMeans(values, resampleScenes, settings.replicates, settings.seed);
+    const resampled = !fixed && new Set(worlds).size >= settings.fewestWorlds;
+    const drawn = resampled ? byWorld(values, worlds) : values;
+    const means = meansOf(values);
+    const centres = meansOf(drawn);
+    const draws = resampledMeans(drawn, resampled, settings.replicates, settings.seed);
     const largest = new Float64Array(settings.replicates);
     const errors = Array.from({ length: n }, () => new Float64Array(n));
     for (let i = 0; i < n; i++) {
       for (let j = i + 1; j < n; j++) {
-        const centre = means[i] - means[j];
+        const centre = centres[i] - centres[j];
         let squares = 0;
         for (const d of draws) squares += (d[i] - d[j] - centre) ** 2;
         const spread = Math.sqrt(squares / draws.length);
@@ -68,8 +75,8 @@ Spike4DGS.intervals = (() => {
         if (spread > 0) draws.forEach((d, r) => (largest[r] = Math.max(largest[r], Math.abs(d[i] - d[j] - centre) / spread)));
       }
     }
-    const critical = largest.slice().sort()[Math.ceil(settings.level * settings.replicates) - 1];
-    const units = resampleScenes ? scenes : values[0].reduce((sum, scene) => sum + scene.length, 0);
+    const critical = Math.max(largest.slice().sort()[Math.ceil(settings.level * settings.replicates) - 1], settings.joint[n]);
+    const units = resampled ? drawn[0].length : drawn[0].reduce((sum, scene) => sum + scene.length, 0);
     const table = settings.widened[Math.min(units, settings.widened.length - 1)];
     const wide = table ? interpolate(critical, settings.grid, table) : Infinity;
     const sign = higher ? 1 : -1;
