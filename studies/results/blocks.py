@@ -20,11 +20,11 @@ NINE = Group("nine-scenes", "The nine scenes", (*TABLE1.scenes, *TABLE2.scenes),
 SMALL_NETWORK = "`spk2img` is a small network that we trained: width 8, published 64, and 2,500 steps."
 _HEADS = ("rank", "row", "PSNR, moving", "behind the first, dB", "PSNR", "SSIM", "FLIP", "fit, s", "images/s", "seeds")
 _LEADS = ((RANKED_BY, "where things move"), ("psnr", "in the whole image"))
-_LEGEND = (
+RANKS = (
     "Ranks are by PSNR where things move; rows that the intervals cannot tell apart share ranks. The number after ± is "
-    "half of the 95 % interval of the paired difference over worlds, which holds for all rows of a block at once. "
-    "Times in parentheses were measured while other programs ran."
+    "half of the 95 % interval of the paired difference over worlds, which holds for all rows of a block at once."
 )
+_LEGEND = f"{RANKS} Times in parentheses were measured while other programs ran."
 
 
 def table_block(group: Group, records: Sequence[Record]) -> list[str]:

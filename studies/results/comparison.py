@@ -48,15 +48,15 @@ class MeasuredRow:
 
     @property
     def is_complete(self) -> bool:
-        """Return whether some seed was measured on every scene, with the metric of the ranks."""
-        return bool(self.seeds) and not self.failed and self.values(RANKED_BY) is not None
+        """Return whether no cell failed, and some seed was measured on every scene with the metric of the ranks."""
+        return self.values(RANKED_BY) is not None
 
     def values(self, metric: str) -> list[Float64] | None:
-        """Return for each scene a metric's values [1, seeds]; None where one is missing."""
+        """Return for each scene a metric's values [1, seeds]; None where one is missing, or a cell failed."""
         found = [
             [self.cells[scene, seed]["metrics"].get(metric) for seed in self.seeds] for scene in self.scenes
         ]  # fmt: skip
-        if not self.seeds or any(value is None for scene in found for value in scene):
+        if not self.seeds or self.failed or any(value is None for scene in found for value in scene):
             return None
         return [np.array([scene], dtype=np.float64) for scene in found]
 

@@ -25,7 +25,7 @@ def covisible_block(records: Sequence[Record]) -> list[str]:
     heads = ("row", "PSNR", "PSNR, co-visible", "between seeds", "between seeds, co-visible")
     legend = (
         "dB. Between seeds: the standard deviation of a scene's value, pooled over scenes. Of conditions: the change "
-        f"of the means of {' and '.join(conditions.WORLDS)}."
+        f"of the means of {' and '.join(conditions.WORLDS)}; of fewer cameras, between two sets of co-visible pixels."
     )
     shown = [record for record in (*own, *under) if METRICS[1] in record["metrics"]]
     groups = realistic.GROUP, *conditions.EVERY

@@ -8,7 +8,7 @@ from pathlib import Path
 from spike4dgs.benchmark.method import get_method
 from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.modality.command import COLUMNS, MEAN, ROWS, Row, plot, value_text
-from spike4dgs.studies.results.blocks import NOTHING, behind_texts, both_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NOTHING, RANKS, behind_texts, both_text, of_group, provenance
 from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import MeasuredRow, Ranking, rank, rows_of
 from spike4dgs.studies.results.plan import PLAN, Group, once
@@ -44,7 +44,10 @@ def modality_block(records: Sequence[Record]) -> list[str]:
         lines.append([ranks, f"`{row.method}`", " and ".join(row.sensors), *texts[:2], behind, *texts[2:]])
     bits, moving, *others = (COLUMNS[column] for column in _SHOWN)
     heads = ("rank", "row", "sensors", bits, moving, "behind the first, dB", *others)
-    return [*markdown(heads, lines), "", f"Means of {len(GROUP.scenes)} scenes.", "", provenance(own, GROUP)]
+    legend = (
+        f"Means of {len(GROUP.scenes)} scenes. {RANKS} Rows with the cameras' calibration stand among rows without."
+    )
+    return [*markdown(heads, lines), "", legend, "", provenance(own, GROUP)]
 
 
 def noisy_block(records: Sequence[Record]) -> list[str]:
