@@ -11,8 +11,8 @@ Differences from the publication, and why:
 
 - The first time is the middle of the clip and tracking goes outward both ways (`start` 0 is the published order): the
   initialisation knows moving things best there, and half as many steps add up their errors.
-- Its masks are silhouettes of each instant, ours hold every pixel that a thing passes (`foreground`). So the silhouette
-  term only forbids moving Gaussians to be seen where nothing ever moves.
+- Its masks are silhouettes of each instant, ours hold every pixel that a thing passes (`silhouettes`). So the
+  silhouette term only forbids moving Gaussians to be seen where nothing ever moves.
 - Gaussians of the background are fixed, the limit of an infinite background weight, and only the part of the
   images in which something moves is rendered again. `freeze_background` False gives the published soft term.
 - A Gaussian that nothing holds would fly on for ever with its velocity. One that has come to where nothing ever moves
@@ -39,6 +39,7 @@ from spike4dgs.baselines.tracking.losses import (
     unit_quaternions,
 )
 from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
+from spike4dgs.baselines.tracking.silhouettes import silhouettes
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.method.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from spike4dgs.method.fit import Algorithm, FitJob
@@ -54,7 +55,7 @@ from spike4dgs.method.supervision.base import difference
 from spike4dgs.method.supervision.pixel import Pixel, PixelSettings
 from spike4dgs.method.torch_state import one_torch_thread, seeded
 from spike4dgs.method.trainer import Trainer
-from spike4dgs.method.training_views.foreground import foreground_masks, foreground_points, moving_window, stray_points
+from spike4dgs.method.training_views.foreground import foreground_points, moving_window, stray_points
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def fit_tracking(job: FitJob, checkpoint_s: float = 15.0) -> TrackedModel:
     """
     checkpoint, device = job.request.checkpoint, job.request.device
     saved = load_checkpoint(checkpoint, job.key) if checkpoint else None
-    masks = foreground_masks(job.training_images.images)
+    masks = silhouettes(job)
     if job.settings["motion"].clean_background:
         images = job.training_images.images
         clean = torch.where(masks, images, images.mean(0))

@@ -81,7 +81,7 @@ SSIR = Published(
         _NOT_STATED,
         "SSIR_e80.pth",
     ),
-    scale=0.378,
+    scale=0.393,
     trained_on=("SREDS",),
     keep_every=2,
     prefix="module.",
@@ -154,12 +154,14 @@ def _run(name: str, published: Published, stream: SpikeStream, tick: int, device
     """Return a network's spikes per tick [H, W] at the start of a tick. Beyond its ends the clip is mirrored."""
     import torch
 
+    from spike4dgs.baselines.images.published.networks import STEP
+
     network = load_network(name, published, find_weights(published.file).path, choose_device(device, rasterizes=False))
-    on = next(network.parameters()).device
-    spikes = window(stream, tick, network.ticks | 1)[: network.ticks]  # of an even number, the last tick is left out
+    on, earlier = next(network.parameters()).device, STEP * (network.windows - 1)
+    spikes = window(stream, tick, (network.ticks | 1) + 2 * earlier)[: network.ticks + earlier]
     with torch.inference_mode():
-        seen = thinned(spikes, published.keep_every)
-        found = network(torch.from_numpy(seen).to(on, torch.float32)[None])[0, 0]
+        seen = torch.from_numpy(thinned(spikes, published.keep_every)).to(on, torch.float32)
+        found = network(seen.unfold(0, network.ticks, STEP).permute(0, 3, 1, 2))[0, 0]
         rate: Float32 = (published.keep_every * published.scale * found).clamp(min=0).cpu().numpy()
     return rate
 
@@ -236,7 +238,13 @@ def _network_maker(name: str, published: Published, definition: str, source: str
 
 MAKERS = (
     _network_maker("ssml", SSML, "SSML's U-Net on the 41 ticks around tick t", "Chen et al., IJCAI 2022", "by SSML"),
-    _network_maker("ssir", SSIR, "SSIR on the 41 ticks around tick t", "Zhao et al., IEEE TCSVT 2023", "by SSIR"),
+    _network_maker(
+        "ssir",
+        SSIR,
+        "SSIR on the 41 ticks around tick t, after three windows before",
+        "Zhao et al., IEEE TCSVT 2023",
+        "by SSIR",
+    ),
     _network_maker(
         "spikeclip",
         SPIKECLIP,

@@ -1,13 +1,15 @@
 """SSML, SSIR and SpikeCLIP: networks from a window of spikes to an image, with the names of their authors' tensors.
 
 Each takes spikes [1, C, H, W] float32 of 0 and 1, upright and centred on the tick, and returns a relative intensity
-[1, 1, H, W]. Sides that a network's strides do not divide are padded by repeating the edge, and the image is cut to
-size.
+[1, 1, H, W]; SSIR takes several windows. Sides that a network's strides do not divide are padded by repeating the edge,
+and the image is cut to size.
 
 SSML       Chen, Duan, Yu, Xiong, Huang: Self-supervised mutual learning for dynamic scene reconstruction of spiking
            camera, IJCAI 2022. The branch without a blind spot: a U-Net of three levels without biases.
 SSIR       Zhao, Xiong, Zhang, Yu, Zhu, Ma, Huang: Spike camera image reconstruction using deep spiking neural networks,
-           IEEE TCSVT 2023. Parametric leaky neurons that see one step: what a layer returns is 0 or 1.
+           IEEE TCSVT 2023. Parametric leaky neurons: what a layer returns is 0 or 1. Its authors train and judge it
+           on windows 20 ticks apart, from one to the next of which the neurons keep their potentials; the image of the
+           first, in which they are at rest, has no part in their loss.
 SpikeCLIP  Chen, Chen, Yu, Huang: Rethinking high-speed image reconstruction framework with spike camera, AAAI 2025.
            The light reconstruction network: five convolutions of 50 sums of four ticks.
 """
@@ -22,6 +24,7 @@ from torch.nn.functional import interpolate, leaky_relu, max_pool2d, pad
 
 SLOPE = 0.1  # of the leaky rectifiers
 _THRESHOLD = 1.0  # of a neuron's potential
+STEP = 20  # ticks between windows of a network that sees several
 
 
 def padded(images: Tensor, multiple: int) -> Tensor:
@@ -50,7 +53,7 @@ def _convolutions(*channels: int) -> nn.Sequential:
 class Ssml(nn.Module):
     """SSML's branch without a blind spot, on 41 ticks."""
 
-    ticks = 41
+    ticks, windows = 41, 1
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,14 +75,20 @@ class Ssml(nn.Module):
 
 
 class _Neuron(nn.Module):
-    """A leaky neuron at rest that sees one step: it fires where sigmoid(w) x reaches the threshold."""
+    """Parametric leaky neurons that begin at rest, and go back to it where they fire (Fang et al., ICCV 2021)."""
 
     def __init__(self) -> None:
         super().__init__()
         self.w = nn.Parameter(torch.zeros(()))
 
     def forward(self, x: Tensor) -> Tensor:
-        return (x * self.w.sigmoid() >= _THRESHOLD).to(x.dtype)
+        """Return 1 where a neuron fires, of inputs [T, C, H, W] one after the other, else 0."""
+        leak, potential, fired = self.w.sigmoid(), torch.zeros_like(x[0]), torch.empty_like(x)
+        for step, seen in enumerate(x):
+            potential = potential + (seen - potential) * leak
+            fired[step] = potential >= _THRESHOLD
+            potential = potential * (1 - fired[step])
+        return fired
 
 
 def _normalised(convolution: nn.Conv2d | nn.ConvTranspose2d, channels: int, *more: nn.Module) -> nn.Sequential:
@@ -130,9 +139,9 @@ class _Head(nn.Module):
 
 
 class Ssir(nn.Module):
-    """SSIR on 41 ticks. It is for inference alone: neurons have no surrogate gradient."""
+    """SSIR on windows of 41 ticks. It is for inference alone: neurons have no surrogate gradient."""
 
-    ticks = 41
+    ticks, windows = 41, 4
 
     def __init__(self) -> None:
         super().__init__()
@@ -143,16 +152,16 @@ class Ssir(nn.Module):
         self.pred3 = _Head(64, 32)
 
     def forward(self, spikes: Tensor) -> Tensor:
-        """Return the intensity [N, 1, H, W] of spikes [N, 41, H, W]."""
+        """Return the intensity [1, 1, H, W] of the last of windows [T, 41, H, W] that begin `STEP` ticks apart."""
         height, width = spikes.shape[-2:]
-        found: Tensor = self.pred3(self.dec3(self.eres1(self.enc1(self.static_conv(padded(spikes, 2))))))
+        found: Tensor = self.pred3(self.dec3(self.eres1(self.enc1(self.static_conv(padded(spikes, 2)))))[-1:])
         return found[..., :height, :width]
 
 
 class SpikeClip(nn.Sequential):
     """SpikeCLIP's light reconstruction network on 200 ticks."""
 
-    ticks = 200
+    ticks, windows = 200, 1
 
     def __init__(self) -> None:
         channels = (50, 64, 128, 64, 16)

@@ -111,6 +111,9 @@ class ScFlow(nn.Module):
 
 
 def mean_along(spikes: Tensor, flow: Tensor) -> Tensor:
-    """Return the mean [H, W] of ticks [T, H, W] around the middle one, sampled along flow [2, H, W] in px a tick."""
-    offsets = torch.arange(len(spikes), device=spikes.device) - len(spikes) // 2
+    """Return the mean [H, W] of ticks [T, H, W], each sampled where flow [2, H, W] in px a tick has come by its middle.
+
+    The flow begins with the tick in the middle of them.
+    """
+    offsets = torch.arange(len(spikes), device=spikes.device) - len(spikes) // 2 + 0.5  # the middle of each tick
     return warp(spikes[:, None], offsets.view(-1, 1, 1, 1) * flow).mean((0, 1))

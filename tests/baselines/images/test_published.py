@@ -25,7 +25,7 @@ from spike4dgs.baselines.images.published.makers import (
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
-from spike4dgs.benchmark.weights import VARIABLE, WeightsError
+from spike4dgs.benchmark.weights import VARIABLE, FoundWeights, WeightsError
 
 BY_NAME = {maker.name: maker for maker in MAKERS}
 
@@ -84,12 +84,37 @@ def test_an_image_has_the_size_of_the_spikes(network: type[torch.nn.Module], siz
         assert made(torch.zeros(1, network.ticks, *size)).shape == (1, 1, *size)
 
 
-def test_a_neuron_at_rest_fires_where_a_parametric_leaky_one_does() -> None:
-    neuron, x = networks._Neuron(), torch.linspace(-3, 3, 601)
+def test_neurons_are_parametric_leaky_ones() -> None:
+    """Fang et al., ICCV 2021: they charge, fire, and go back to rest where they fired."""
+    neuron, inputs = networks._Neuron(), np.random.default_rng(0).normal(0.8, 1, (5, 3, 4, 6))
     with torch.no_grad():
         neuron.w.fill_(0.3)
-        potential = 0.0 + (x - 0.0) / (1 + np.exp(-0.3))  # of Fang et al., ICCV 2021, one step from rest
-        np.testing.assert_array_equal(neuron(x), (potential >= 1.0).float())
+        fired = neuron(torch.tensor(inputs)).numpy()
+    potential, leak = np.zeros(inputs.shape[1:]), 1 / (1 + np.exp(-0.3))
+    for x, found in zip(inputs, fired, strict=True):
+        potential += leak * (x - potential)
+        np.testing.assert_array_equal(found, potential >= 1)
+        potential[potential >= 1] = 0
+    assert 0.1 < fired.mean() < 0.5 and (fired[0] != fired[-1]).any()
+
+
+def test_ssir_sees_the_windows_before_as_its_authors_sequences_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each pixel's thinned spikes are the same ones in every window."""
+    seen: list[torch.Tensor] = []
+
+    class Looks(networks.Ssir):
+        def forward(self, spikes: torch.Tensor) -> torch.Tensor:
+            seen.append(spikes)
+            return super().forward(spikes)
+
+    monkeypatch.setattr(makers, "load_network", lambda *_: Looks().eval())
+    monkeypatch.setattr(makers, "find_weights", lambda _: FoundWeights(Path()))
+    stream = regular(0.3)
+    BY_NAME["ssir"](stream, [120], 1.0)
+    kept = thinned(stream.window(40, 141), SSIR.keep_every)
+    assert seen[0].shape == (4, 41, 24, 40)
+    for spikes, first in zip(seen[0].numpy(), (0, 20, 40, 60), strict=True):
+        np.testing.assert_array_equal(spikes, kept[first : first + 41])
 
 
 def test_warping_and_correlating_are_those_of_scipy_and_of_loops() -> None:

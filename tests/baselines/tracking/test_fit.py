@@ -11,15 +11,18 @@ from scipy.spatial.transform import Rotation, Slerp
 from toy_fits import silent
 from toy_world import ToyWorld
 
+from spike4dgs.baselines.images.tfi import tfi_image
 from spike4dgs.baselines.tracking import fit
 from spike4dgs.baselines.tracking.losses import find_neighbours
 from spike4dgs.baselines.tracking.model import TrackedModel, Tracks
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.scene.scene import TrainingScene
+from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import FitJob
 from spike4dgs.method.gaussians.parameters import Gaussians, from_points
 from spike4dgs.method.images.light import Light
+from spike4dgs.method.images.training import ImageSettings
 from spike4dgs.method.settings import override
 from spike4dgs.method.splat import Views
 from spike4dgs.method.starts.base import Start, measure
@@ -70,6 +73,23 @@ def test_times_are_visited_outward_with_the_velocity_known_so_far() -> None:
         assert {v.before, *([] if v.earlier is None else [v.earlier])} <= known
         known.add(v.index)
     assert known == set(range(20))
+
+
+def test_noise_of_images_does_not_pass_for_motion() -> None:
+    """Still light with TFI's noise, which grows with the square of the light; and of a sensor that fired nothing."""
+    height, width = CAMERAS[0].height, CAMERAS[0].width
+    rate = np.broadcast_to(np.linspace(0.03, 0.55, width), (height, width))
+    phase = np.random.default_rng(0).random((len(CAMERAS), height, width))
+    fired = [np.diff(np.floor(p + rate * np.arange(WORLD.n_ticks + 1)[:, None, None]), axis=0) for p in phase]
+    streams = tuple(SpikeStream(pack(f), width, height, 20_000.0) for f in fired)
+    ticks = tuple(range(16, WORLD.n_ticks - 16, 16))
+    images = torch.tensor(np.array([[tfi_image(s, t) for s in streams] for t in ticks]) / np.float32(0.6))
+    one = job()
+    seen = replace(one.training_images, images=images.float(), ticks=ticks)
+    one = replace(one, training_images=seen, settings={**one.settings, "images": ImageSettings(16)})
+    scene = TrainingScene("toy", "toy", CAMERAS, streams, 20_000.0, WORLD.n_ticks, 0.6)
+    assert fit.silhouettes(replace(one, scene=scene)).float().mean() < 0.01
+    assert fit.silhouettes(one).float().mean() > 0.3
 
 
 @pytest.mark.parametrize(("start", "index"), [(0.0, 0), (0.5, 2), (1.0, 4), (-3.0, 0), (9.0, 4)])
