@@ -271,6 +271,8 @@ def fit_gaussians(
     points, values = at_most(density.max_gaussians, start, request.seed)
     initial = {"opacity": settings.initial_opacity, "scale": settings.initial_scale}
     first = motion.initialize(from_points(points, values, **initial, device=request.device), job.training_images)
+    # The cap is of what points become: a motion may lay a point down at several times, which leaves as much room.
+    density = replace(density, max_per_pixel=density.max_per_pixel * len(first) / len(points))
     loss = supervise(job.settings["supervision"], job.scene).to(request.device)
     own: Any = {"scale": job.extent.scale, "seed": request.seed, "path": start.path, "parts": job.parts}
     trainer = Trainer(job.training_images, first, motion, loss, settings, density, **own)

@@ -11,8 +11,7 @@ Differences from the publication, and why:
 
 - The first time is the middle of the clip and tracking goes outward both ways (`start` 0 is the published order): the
   initialisation knows moving things best there, and half as many steps add up their errors.
-- Its masks are silhouettes of each instant, ours hold every pixel that a thing passes (`silhouettes`). So the
-  silhouette term only forbids moving Gaussians to be seen where nothing ever moves.
+- Its masks are of each instant, ours of all pixels that a thing passes: they forbid moving ones where nothing moves.
 - Gaussians of the background are fixed, the limit of an infinite background weight, and only the part of the
   images in which something moves is rendered again. `freeze_background` False gives the published soft term.
 - A Gaussian that nothing holds would fly on for ever with its velocity. One that has come to where nothing ever moves

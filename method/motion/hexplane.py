@@ -40,7 +40,7 @@ class HexPlaneSettings(Settings):
 
     cell_px: float = 3.0  # finest spatial cell, in pixels of a view across the box
     levels: int = 2  # multires 1, 2
-    cell_ticks: float = 16.0  # time cell
+    cell_ticks: float = 40.0  # time cell: four images, as 4DGS's 75 cells of 300 frames have
     features: int = 16  # per plane and level, 4DGS's dynerf preset
     mlp_width: int = 32  # 4DGS: 128
     lr_grid: float = 1e-2

@@ -11,13 +11,19 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 from small_scenes import array_cameras
 from torch import Tensor
+from toy_fits import PARTS as TOY_PARTS
+from toy_fits import WORLD as TOY
+from toy_fits import surfaces
 from toy_world import ToyWorld
 
 from spike4dgs.baselines import spacetime
 from spike4dgs.baselines.recipes import PARTS
+from spike4dgs.benchmark.method import FitRequest, Recipe
 from spike4dgs.benchmark.scene.cameras import Camera
+from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.gaussians.density import DensitySettings, GradientStatistics, adapt_density
 from spike4dgs.method.gaussians.parameters import Gaussians, concatenate, densify, prune, relocate
+from spike4dgs.method.models.fitted_model import FittedModel
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.motion.polynomial import move_to
 from spike4dgs.method.splat import Splats, Views, render
@@ -351,3 +357,21 @@ def test_the_two_worst_views_ask_for_gaussians_at_their_worst_times() -> None:
     assert [t for _, t in new] == [0.1], "nothing was measured"
     assert torch.equal(more.means[: len(g)], g.means)
     assert set(more.extra["times"][len(g) :].tolist()) == set(torch.tensor([0.9, 0.1]).tolist())
+
+
+@pytest.mark.parametrize(("name", "copies"), [("hexplane", 1), ("spacetime", 3)])
+def test_a_cap_leaves_as_much_room_where_points_are_laid_down_at_several_times(name: str, copies: int) -> None:
+    points = len(surfaces(TOY.training, 0).points)
+    own = {
+        "images.time_spacing_ticks": 40,
+        "trainer.coarse_steps": 4,
+        "trainer.fine_steps": 16,
+        "density.refine_every": 2,
+        "density.grow_grad2d": 0.0,
+        "density.max_per_pixel": 1.2 * points / (TOY.width * TOY.height),
+    }
+    if copies > 1:  # all points move
+        own |= {"motion.moving_change": -1.0, "motion.moving_copies": copies, "motion.guided_rounds": 0}
+    model = RecipeMethod(Recipe("test", "short", "true", name, "pixel", own), TOY_PARTS).fit(TOY.training, FitRequest())
+    assert isinstance(model, FittedModel)
+    assert 1.1 * copies * points < len(model.pieces[0]) <= 1.21 * copies * points

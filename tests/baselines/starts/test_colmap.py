@@ -78,15 +78,15 @@ def test_a_failure_says_how_many_views_are_registered(monkeypatch: pytest.Monkey
         colmap(WORLD.training, 0)
 
 
-def test_few_points_are_replaced_by_a_plane_sweep_with_the_estimated_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_are_those_of_a_plane_sweep_with_the_estimated_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as rows with given poses begin with, however few features the views have in common."""
     scene = WORLD.training
     moved = tuple(replace(c, t=c.t + [0.0, 0.0, 0.01]) for c in scene.cameras)
-    for count in (ColmapSettings().min_points - 1, ColmapSettings().min_points):
-        found = Mapping(moved, np.ones((count, 3)), np.ones(count, np.float32))
-        monkeypatch.setattr(module, "map_views", lambda *a, found=found, **k: found)
-        start = colmap(scene, 0)
-        assert start.cameras == moved
-        assert (len(start.points) > 500) == (count < ColmapSettings().min_points)
+    found = Mapping(moved, np.ones((3, 3)), np.ones(3, np.float32))
+    monkeypatch.setattr(module, "map_views", lambda *a, **k: found)
+    start, given = colmap(scene, 0), rig(replace(scene, cameras=moved))
+    assert start.cameras == moved
+    np.testing.assert_array_equal(start.points, given.points)
 
 
 class UnevenWorld(ToyWorld):
