@@ -158,8 +158,8 @@ def test_a_model_of_the_version_with_flat_settings_renders_as_then(name: str, tm
     old, new = (safetensors.torch.load_file(p) for p in (FLAT / f"{name}.safetensors", tmp_path / "m"))
     assert old.keys() == new.keys() and all(torch.equal(v, new[k]) for k, v in old.items())
     settings = read_model(tmp_path / "m").config["motion"]["settings"]
-    smaller = {"features": 4, "mlp_width": 8} if name == "hexplane" else {}
-    assert settings == dataclasses.asdict(MOTIONS[name].defaults) | smaller
+    own = {"features": 4, "mlp_width": 8, "cell_ticks": 16.0} if name == "hexplane" else {}
+    assert settings == dataclasses.asdict(MOTIONS[name].defaults) | own
 
 
 def test_where_it_comes_from_is_kept(tmp_path: Path) -> None:
