@@ -137,7 +137,7 @@ KNOBS = (
     _choice("first_scale", "trainer", "initial_scale", 0.5, 0.7, 1.0),
     replace(_choice("views_per_step", "trainer", "views_per_step", 2, 4), has=_has_static_share),  # steps follow there
     _choice("average", "trainer", "average", 0.0, 0.2),
-    _choice("time_cell", "motion", "cell_ticks", 16.0, 32.0, 64.0, 100.0),
+    _choice("time_cell", "motion", "cell_ticks", 16.0, 40.0, 64.0, 100.0),
     _choice("copies", "motion", "moving_copies", 2, 3, 5, 8),
     _choice("lifetime", "motion", "moving_temporal_scale", 0.1, 0.2, 0.3, 0.6),
     _choice("window", "image_maker", "half_window", 10, 14, 20, 28, 40),
