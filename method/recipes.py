@@ -34,7 +34,7 @@ PARTS = Parts(
         "msdi": Initialization(
             lambda r: msdi(r.scene, r.settings, r.device),
             MsdiSettings(),
-            label="points by MSDI",
+            label="matches between views, MSDI's points in gaps",
             calibrated=True,
             networks=(POINTS,),
         ),

@@ -24,7 +24,7 @@ class TrainerSettings(Settings):
 
     # Steps. One step renders several views at one time, where 4DGS takes one image: a step of four views is 4 there.
     coarse_steps: int = 300  # static stage (4DGS: 3000 single images)
-    fine_steps: int = 1200  # deforming stage (4DGS: 14000 single images)
+    fine_steps: int = 1200  # deforming stage (4DGS: 15000 single images)
     piece_steps: int = 800  # more of them for each further 20 ms of a long clip
     views_per_step: int = 4  # they share one time and one deformation; of 8 views only half as many steps fit the time
     ramp: float = 0.3  # share of the fine stage in which the times open up from the middle to the whole clip

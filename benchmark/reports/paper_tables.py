@@ -27,7 +27,8 @@ from spike4dgs.benchmark.scene.scene import Scene
 SCHEMA = "spike4dgs-table/1"
 POSES = ("given", "estimated")  # are methods given the rig's poses?
 UNCALIBRATED_NOTE = (
-    "How the published rows got their poses is not stated: the same values stand here and where the poses are given."
+    "The paper takes its own method's poses from MSDI and says that the other rows begin with DUSt3R's points: "
+    "the same values stand here and where the poses are given."
 )
 MEAN = "mean"  # column of rows that are published without their scenes
 ALSO = ("psnr", "ssim", "psnr_dynamic", "ssim_dynamic", "flip")  # measured beside the published metrics

@@ -50,7 +50,7 @@ def msdi_maker(device: str) -> ImageMaker:
     return ImageMaker(
         name="msdi",
         definition="MSDI's image network: adaptive's windows and the 41 ticks around tick t",
-        source="Spike4DGS, eq. 12",
+        source="this project, in the place of Spike4DGS's eq. 12",
         rate=lambda stream, tick, _: msdi_image(stream, tick, device=device),
         learned=partial(learned_from, WEIGHTS.in_use, WEIGHTS.read_card),
         corrected=partial(msdi_image, device=device),

@@ -45,9 +45,10 @@ class MsdiConfig:
         return 0, n // 2, 3 * n // 4, n
 
 
-# The paper: ViT-L encoders of DUSt3R and the 24-layer transformer of Fast3R's published weights (1024 wide), with
-# their DPT head; one shift-based layer of 96 channels a direction and BCONV as in the blind-spot network. Three
-# embedded channels are what the pre-trained patch embedding takes.
+# The paper: ViT encoders, a transformer of 24 layers as in Fast3R, a DPT head, one shift-based layer and three
+# convolutions for images. The sizes are those of the systems that it cites: DUSt3R's ViT-L and Fast3R's published
+# weights (1024 wide), and 96 channels a direction as in the blind-spot network. Three embedded channels are what the
+# pre-trained patch embedding takes.
 PAPER = MsdiConfig(
     name="paper",
     ticks=41,

@@ -16,7 +16,8 @@ Public is the text of these equations. It leaves open, and is read here as follo
   of Gamma binary spikes, but for the width of a sigmoid. It is trained with the Gaussians.
 - std: that of the population, which is 0 and not undefined for a window of one tick. Its slope is infinite where the
   variance is 0, so FLOOR is added to both variances.
-- Gamma = `spike_ticks`. At the clip's ends R's window is shorter; averages and deviations are compared all the same.
+- Gamma = `spike_ticks`: not published; 40, a window of TFP. At the clip's ends R's window is shorter; averages and
+  deviations are compared all the same.
 
 Properties. Spikes are 0 or 1, so that std R = sqrt(a (1 - a)) with a = avg R, exactly: the second term of eq.
 17 holds nothing that the first does not. It weights it, most where pixels are dark and nothing at a = 1/2.
