@@ -28,7 +28,6 @@ from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.method import recipes as ours
 from spike4dgs.method.fit import Parts, RecipeMethod
 from spike4dgs.method.recipes import FLAT, MSDI_SETTINGS
-from spike4dgs.method.settings import FLAT_FIELD
 from spike4dgs.method.starts.base import Initialization
 from spike4dgs.method.tuned import read_tuned, tuned
 
@@ -127,15 +126,7 @@ POSED = (
     ),
     # Tables 3 and 7.
     Recipe("tfp+dust3r+4dgs", "tfp", "dust3r", "hexplane", "pixel"),
-    # COLMAP saw raw images when this row was published.
-    Recipe(
-        "msdi+colmap+4dgs",
-        "msdi",
-        "colmap",
-        "hexplane",
-        "pixel",
-        {**MSDI_SETTINGS, f"initialization.{FLAT_FIELD}": False},
-    ),
+    Recipe("msdi+colmap+4dgs", "msdi", "colmap", "hexplane", "pixel", MSDI_SETTINGS),
     Recipe("msdi+dust3r+4dgs", "msdi", "dust3r", "hexplane", "pixel", MSDI_SETTINGS),
     Recipe("tfi+dust3r+4dgs", "tfi", "dust3r", "hexplane", "pixel"),
     Recipe("tfi+colmap+4dgs+spss", "tfi", "colmap", "hexplane", "spss"),
