@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.files import MOST_BYTES, read_bytes
+from spike4dgs.benchmark.files import read_bytes
 from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.method import GROUP, Budget, Method, find_methods, get_method
 from spike4dgs.benchmark.plugins import is_distributed
@@ -32,6 +32,7 @@ PROGRESS, NOTE, RENDERED, DONE, FAILED = "progress", "note", "rendered", "done",
 COSTS = ("fit_seconds", "render_fps", "peak_memory_mb", "model_mb")
 MODEL = "model.safetensors"  # in the work folder
 MOST = 1 << 20  # bytes of a line
+MOST_OF_IMAGE = 1 << 30  # noise of 8 Mpx has 16 MiB
 _LENGTH = struct.Struct("<Q")
 _PLAIN = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # a FIFO does not hold the reader
 
@@ -67,7 +68,8 @@ def images_folder(work: Path, variant: int) -> Path:
 def read_image(folder: Path, name: str) -> bytes:
     """Return the bytes of FOLDER/NAME, which the process wrote, and may still change.
 
-    Raises UserError for no plain file, and where the folder or what is below it is a link: to what is not its own.
+    Raises UserError for no plain file, for one of more than MOST_OF_IMAGE bytes, and where the folder or what is below
+    it is a link: to what is not its own.
     """
     wrong = problem(folder / name, "an image of a target", "none", "correct the method that rendered it")
     *inner, last = Path(name).parts
@@ -75,7 +77,7 @@ def read_image(folder: Path, name: str) -> bytes:
         paths = [folder, *(folder.joinpath(*inner[: i + 1]) for i in range(len(inner))), folder / name]
         if any(path.is_symlink() for path in paths) or not paths[-1].is_file():
             raise wrong
-        return read_bytes(paths[-1], "an image")
+        return read_bytes(paths[-1], "an image of a target", MOST_OF_IMAGE)
     with ExitStack() as opened:
         try:
             at: int | None = None
@@ -86,8 +88,11 @@ def read_image(folder: Path, name: str) -> bytes:
         except OSError:
             raise wrong from None
         facts = os.fstat(file.fileno())
-        if not stat.S_ISREG(facts.st_mode) or facts.st_size > MOST_BYTES:
+        if not stat.S_ISREG(facts.st_mode):
             raise wrong
+        if facts.st_size > MOST_OF_IMAGE:
+            expected = f"an image of a target, {MOST_OF_IMAGE} bytes at most"
+            raise problem(folder / name, expected, f"{facts.st_size}", "correct the method that rendered it")
         return file.read()
 
 

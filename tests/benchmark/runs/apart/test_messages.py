@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from spike4dgs.benchmark import UserError
-from spike4dgs.benchmark.runs.apart.messages import read_image
+from spike4dgs.benchmark.files import MOST_BYTES
+from spike4dgs.benchmark.runs.apart.messages import MOST_OF_IMAGE, read_image
 
 
 def test_an_image_is_read_and_stays(tmp_path: Path) -> None:
@@ -14,6 +15,15 @@ def test_an_image_is_read_and_stays(tmp_path: Path) -> None:
     (tmp_path / "images-0/cam_03/000020.exr").write_bytes(b"image")
     assert read_image(tmp_path / "images-0", "cam_03/000020.exr") == b"image"
     assert (tmp_path / "images-0/cam_03/000020.exr").is_file()
+
+
+def test_an_image_may_be_larger_than_a_text(tmp_path: Path) -> None:
+    with open(tmp_path / "a.exr", "wb") as file:
+        file.truncate(MOST_BYTES + 1)  # noise of 9 Mpx in half floats
+    assert len(read_image(tmp_path, "a.exr")) == MOST_BYTES + 1
+    os.truncate(tmp_path / "a.exr", MOST_OF_IMAGE + 1)
+    with pytest.raises(UserError, match=f"{MOST_OF_IMAGE} bytes at most, found {MOST_OF_IMAGE + 1};"):
+        read_image(tmp_path, "a.exr")
 
 
 @pytest.mark.parametrize("linked", ["images-0", "images-0/cam_03", "images-0/cam_03/000020.exr", "FIFO", "nothing"])
