@@ -107,7 +107,7 @@ def _read(path: Path) -> UInt8:
             if deep or image.mode not in _MODES:
                 found = f"mode {image.mode}" + (", of more bits" if deep else "")
                 raise problem(path, "an image of 8 bits a channel", found, "export it with 8 bits")
-            if (count := getattr(image, "n_frames", 1)) > 1:
+            if (count := getattr(image, "n_frames", 1)) > 1 and image.format != "MPO":  # JPEG with previews behind it
                 raise problem(path, "a file for each frame", f"{count} frames in one", "export them one by one")
             if (turned := image.getexif().get(_ORIENTATION, 1)) not in _UPRIGHT:
                 fix = "export it upright, as its camera was calibrated"

@@ -121,7 +121,7 @@ def load_mitsuba() -> ModuleType:
 def _cached_probe() -> str:
     """Return why the fast variant fails ("" if it works), from the cache file or from a new probe.
 
-    An answer that may be due to a moment's load or lack of memory is not kept, nor one where no file of LLVM was found:
+    A failure that may be due to a moment's load or lack of memory is not kept, nor one where no file of LLVM was found:
     a later installation would not show.
     """
     path = user_cache() / f"mitsuba-{_fingerprint()}.json"
@@ -130,7 +130,7 @@ def _cached_probe() -> str:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     why_not, passing = _probe()
-    if passing or not _llvm_files():
+    if passing or (why_not and not _llvm_files()):
         return why_not
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

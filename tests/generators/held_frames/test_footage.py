@@ -60,6 +60,14 @@ def test_colour_and_palette_images_are_rgb(tmp_path: Path) -> None:
     assert first.shape == (HEIGHT, WIDTH, 3) and (first == (10, 20, 30)).all() and (second == first).all()
 
 
+def test_a_jpeg_with_a_preview_is_its_first_image(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    image, preview = (Image.new("RGB", (WIDTH // k, HEIGHT // k), (60 * k, 60, 60)) for k in (1, 2))
+    image.save(tmp_path / "a/0.jpg", format="MPO", save_all=True, append_images=[preview])
+    (read,) = read_frames(find_footage(tmp_path)["a"], [0])
+    assert read.shape == (HEIGHT, WIDTH, 3) and np.abs(read - 60.0).max() < 3
+
+
 def other_size(folder: Path) -> None:
     for path in (folder / "cam_1").iterdir():
         Image.new("L", (WIDTH, HEIGHT + 1)).save(path)

@@ -76,6 +76,24 @@ def test_a_failure_that_may_pass_is_not_remembered(
     assert not list(tmp_path.glob("spike4dgs/mitsuba-*"))
 
 
+def test_an_answer_without_a_file_of_llvm_is_kept_where_it_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A conda environment's libLLVM lies elsewhere; a failure is asked again, as LLVM may have been installed."""
+    child, asked = tmp_path / "python", tmp_path / "asked"
+    child.write_text(f"#!/bin/sh\necho >> {asked}\n. {tmp_path}/answer\n")
+    child.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(child))
+    monkeypatch.setattr(mitsuba_variant, "_LLVM_PATHS", ())
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for name in (OVERRIDE, "DRJIT_LIBLLVM_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    for answer, why_not, times in (("exit 3", "exit code 3", 2), ("echo works", "", 3)):
+        (tmp_path / "answer").write_text(answer)
+        assert [mitsuba_variant.diagnose().why_not_fast for _ in range(2)] == [why_not] * 2
+        assert len(asked.read_text().splitlines()) == times
+
+
 @pytest.fixture
 def fresh_choice() -> Iterator[None]:
     """The variant is picked anew in the test, and after it."""
