@@ -260,7 +260,7 @@ def _check(physics: Physics) -> None:
 
 def from_settings(settings: Mapping[str, Any]) -> Physics:
     """Return the physics of `Physics.settings`."""
-    values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in settings.items()}
+    values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in {**settings}.items()}
     return Physics(**values)
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from spike4dgs.benchmark.screen.shown import Table
+from spike4dgs.benchmark.untrusted import shown
 from spike4dgs.benchmark.variants import DEVELOPMENT_VARIANTS, PUBLIC_VARIANT, PUBLIC_VARIANTS
-from spike4dgs.generators.physics import IDEAL, REALISTIC, Physics
+from spike4dgs.generators.physics import IDEAL, REALISTIC, Physics, from_settings
 from spike4dgs.generators.sensor.light import Flicker
 
 RATE_HZ = 20_000
@@ -183,6 +185,27 @@ class Job:
     physics: Physics = Physics()
     noise: int = 0  # another number gives the rendering other noise, and changes nothing else
 
+    @staticmethod
+    def from_settings(settings: Mapping[str, Any]) -> Job:
+        """Return the job of `settings`, which a file may have.
+
+        Raises KeyError, TypeError or ValueError where some lack or are of another kind.
+        """
+        same = {"gain_map", "dark_map", "shot_noise", "sub_ticks", "whole_frames", "noise"} & settings.keys()
+        job = Job(
+            settings["world"],
+            settings["variant"],
+            int(settings["seed"]),
+            settings["profile"],
+            Profile.from_settings(settings["sampling"]),
+            settings["seconds"],
+            adaptive=settings.get("adaptive_keys", True),
+            physics=from_settings(settings.get("physics", {})),
+            **{name: settings[name] for name in same},
+        )
+        _check_kinds(job)
+        return job
+
     @property
     def id(self) -> str:
         """Id such as `car-0-small`; with a length that is not the profile's, such as `car-0-paper-500ms`.
@@ -246,6 +269,27 @@ class Job:
     def sparse_ticks(self) -> range:
         """Ticks among `target_ticks` at which all other cameras have ground truth too."""
         return range(self.profile.sparse_every, self.target_ticks.stop, self.profile.sparse_every)
+
+
+def _check_kinds(settings: Any) -> None:
+    """Raise TypeError for the first field of a dataclass whose value is not of its type, however deep."""
+    for name, kind in get_type_hints(type(settings)).items():
+        if not _has_kind(value := getattr(settings, name), kind):
+            raise TypeError(f"{name} {shown(value)}")
+        if is_dataclass(value):
+            _check_kinds(value)
+
+
+def _has_kind(value: Any, kind: Any) -> bool:
+    """Return whether a value is of a type; integers count from 0, numbers are finite."""
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple) and all(_has_kind(v, get_args(kind)[0]) for v in value)
+    if choices := get_args(kind):
+        return any(_has_kind(value, choice) for choice in choices)
+    if kind not in (int, float):
+        return isinstance(value, kind)
+    plain = isinstance(value, int | kind) and not isinstance(value, bool)
+    return plain and (value >= 0 if kind is int else math.isfinite(value))
 
 
 HELD_OUT_VIEW = 4

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.runs.executors import Run, chunked, here
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.generators.physics import from_settings, true_cameras
-from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job, Profile
+from spike4dgs.generators.physics import true_cameras
+from spike4dgs.generators.profiles import HELD_OUT_VIEW, RATE_HZ, TARGET_EVERY, Job
 from spike4dgs.generators.rendering.image_motion import KeyPlan, key_plan
 from spike4dgs.generators.rendering.keyframes import finite, read_arrays, write_arrays
 from spike4dgs.generators.rendering.lights.layers import Renderer, path_renderer
@@ -37,28 +37,18 @@ _OF_SPLIT = ("soft_static", "maps_of")  # arguments that renderers of whole path
 Watch = Callable[[str, Iterable[Any], int], Iterator[Any]]
 
 
-def recorded_job(source: Mapping[str, Any]) -> Job | None:
-    """Return the job whose `settings` are in the `source` of a scene.json; None where no world here made the scene.
+def recorded_job(source: Mapping[str, Any], root: Path) -> Job | None:
+    """Return the job whose `settings` are the `source` of ROOT/scene.json; None where no world here made the scene.
 
     Raises UserError where settings lack or are of another kind.
     """
     if source["kind"] != "mitsuba" or not isinstance(world := source.get("world"), str) or world not in WORLDS:
         return None
-    same = {"gain_map", "dark_map", "shot_noise", "sub_ticks", "whole_frames", "noise"} & source.keys()
     try:
-        return Job(
-            world,
-            source["variant"],
-            int(source["seed"]),
-            source["profile"],
-            Profile.from_settings(source["sampling"]),
-            source["seconds"],
-            adaptive=source.get("adaptive_keys", True),
-            physics=from_settings(source.get("physics", {})),
-            **{name: source[name] for name in same},
-        )
+        return Job.from_settings(source)
     except (KeyError, TypeError, ValueError) as e:
-        raise problem("scene.json, source", f"the settings of {world}", repr(e)[:200], "make it again") from None
+        where = f"{root / 'scene.json'}, source"
+        raise problem(where, f"the settings of {world}", repr(e)[:200], "make it again") from None
 
 
 @lru_cache(maxsize=1)

@@ -253,7 +253,7 @@ def second_renderings(
     rendering has the noise of ground truth. None for a scene that no world of this installation made, and for a split
     whose held-out cameras have no such target. Raises UserError where one is not finite.
     """
-    job = recorded_job(scene.meta["source"])
+    job = recorded_job(scene.meta["source"], scene.root)
     if job is None:
         return None
     camera = cameras_of(job)[held_out_view(job)]

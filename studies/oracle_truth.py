@@ -149,7 +149,7 @@ def find_truth(scene: Scene) -> WorldTruth:
     and where they or the light move with time, which the renderings here do not.
     """
     fix = "make the scene with `spike4dgs make-dataset`"
-    if (job := recorded_job(scene.meta["source"])) is None:
+    if (job := recorded_job(scene.meta["source"], scene.root)) is None:
         source = scene.meta["source"]
         raise problem(scene.root, "a scene whose world is here, for oracles", f"source {source.get('kind')!r}", fix)
     if job.physics.moves_array or job.flicker or world_of(job).flash:

@@ -26,6 +26,7 @@ from spike4dgs.generators.streams import sensor_of
 
 JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 PLAIN = replace(JOB, world="blank")  # takes no time to build
+ROOT = Path(JOB.id)
 
 
 def job(**physics):
@@ -80,14 +81,34 @@ def test_settings_are_read_back():
     for physics in (Physics(), CAMERAS["realistic"], Physics(flicker=0.3, pose_noise_deg=0.1, dead_ticks=2)):
         assert from_settings(json.loads(json.dumps(physics.settings))) == physics
         made = replace(JOB, physics=physics)
-        assert recorded_job(json.loads(json.dumps(made.settings))) == made
+        assert recorded_job(json.loads(json.dumps(made.settings)), ROOT) == made
 
 
-@pytest.mark.parametrize("change", [{"seed": None}, {"sampling": {}}, {"physics": {"glare": 1}}])
-def test_settings_that_are_no_worlds_are_one_error(change):
-    with pytest.raises(UserError, match="scene.json, source: expected the settings of car"):
-        recorded_job(json.loads(json.dumps(JOB.settings)) | change)
-    assert recorded_job({"kind": "mitsuba"}) is None and recorded_job({"kind": "mitsuba", "world": ["car"]}) is None
+SAMPLING = JOB.settings["sampling"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seed": None},
+        {"seed": -1},
+        {"variant": "x"},
+        {"variant": True},
+        {"seconds": "x"},
+        {"sampling": {}},
+        {"sampling": SAMPLING | {"width": "w"}},
+        {"sampling": SAMPLING | {"views": ["v"]}},
+        {"sampling": SAMPLING | {"soft": {"paths": "p", "gloss_paths": 1, "sigma_px": 1, "anchor_px": 1, "spread": 1}}},
+        {"physics": []},
+        {"physics": {"glare": 1}},
+        {"physics": {"light": "bright"}},
+    ],
+)
+def test_settings_that_are_no_worlds_are_one_error_that_names_the_scene(change):
+    with pytest.raises(UserError, match="^car-0-tiny/scene.json, source: expected the settings of car"):
+        recorded_job(json.loads(json.dumps(JOB.settings)) | change, ROOT)
+    for source in ({"kind": "mitsuba"}, {"kind": "mitsuba", "world": ["car"]}):
+        assert recorded_job(source, ROOT) is None
 
 
 def test_an_option_replaces_that_of_the_named_camera():
@@ -222,7 +243,7 @@ def test_an_array_that_moves_is_recorded_beside_the_scene_and_changes_no_camera(
     moving = job(array_motion=2.0, array_rotation=30.0)
     scene = made(moving)
     assert scene.name == "car-0-tiny-arraymotion-arrayrotation"
-    assert recorded_job(json.loads((scene / "scene.json").read_text())["source"]) == moving
+    assert recorded_job(json.loads((scene / "scene.json").read_text())["source"], scene) == moving
     assert (scene / "transforms_all.json").read_bytes() == (ideal / "transforms_all.json").read_bytes()
     told = json.loads((scene / "truth/array_path.json").read_text())
     assert told["ticks"] == [0, 20, 40, 60, 80] and not (ideal / "truth/array_path.json").exists()

@@ -42,8 +42,8 @@ def test_a_scene_records_the_job_that_made_it() -> None:
         Job("car", 0, 0, "tiny", PROFILES["tiny"], 0.004),
         Job("van", 3, 2**70, "small", PROFILES["small"], 0.5, False, False, False, False, False, True, physics, 2),
     ):
-        assert recorded_job(json.loads(json.dumps(job.settings))) == job
-    assert recorded_job({"kind": "mitsuba", "world": "nowhere"}) is None
+        assert recorded_job(json.loads(json.dumps(job.settings)), Path()) == job
+    assert recorded_job({"kind": "mitsuba", "world": "nowhere"}, Path()) is None
 
 
 def rms(a: np.ndarray, b: np.ndarray) -> float:
