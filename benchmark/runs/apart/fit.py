@@ -26,6 +26,7 @@ from typing import IO, Any, cast
 from uuid import uuid4
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.files import atomic_path
 from spike4dgs.benchmark.method import DEFAULT_GIVEN, Progress
 from spike4dgs.benchmark.release.publish import TOKENS
 from spike4dgs.benchmark.release.source import VARIABLE as RELEASE
@@ -147,8 +148,8 @@ def _take(job: Job, folders: Sequence[Path], model_path: Path, work: Path, child
                 child.send(Rest(provenance_of(job, cast(float, costs["fit_seconds"])), views))
         child.wait(DONE)
         if (work / MODEL).is_file() and not (work / MODEL).is_symlink():
-            model_path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.move(work / MODEL, model_path)  # a worker's own folder may lie on another disk
+            with atomic_path(model_path) as part:  # a worker's own folder may lie on another disk
+                shutil.move(work / MODEL, part)
 
 
 class _Child:
@@ -192,11 +193,14 @@ class _Child:
 
     def _line(self) -> bytes:
         """Return the next line; none at the end, and where the process has died while a child of its own goes on."""
-        # Without the buffer, of which `select` knows nothing.
+        # Without the buffer, of which `poll` knows nothing.
         pipe = cast(io.RawIOBase, cast(io.BufferedReader, self._process.stdout).raw)
-        while os.name == "posix" and not select.select([pipe], [], [], _POLL_S)[0]:
-            if self._process.poll() is not None:
-                return b""
+        if hasattr(select, "poll"):  # Windows has none
+            waiting = select.poll()
+            waiting.register(pipe, select.POLLIN)
+            while not waiting.poll(1000 * _POLL_S):
+                if self._process.poll() is not None and not waiting.poll(0):  # not even a last line
+                    return b""
         return pipe.readline(MOST)
 
     def _ended(self) -> Exception:

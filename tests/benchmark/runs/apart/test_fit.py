@@ -1,15 +1,17 @@
 """A fit in a process that sees the training part alone: what it sees, what it makes, and how it ends."""
 
+import fcntl
 import io
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import dummy_methods
 import pytest
@@ -20,7 +22,7 @@ from rich.console import Console
 from small_scenes import write_small_scene
 
 from spike4dgs.benchmark import Budget, UserError, get_method, open_scene
-from spike4dgs.benchmark.runs.apart.fit import Apart, _environment, _training_part, fit_apart
+from spike4dgs.benchmark.runs.apart.fit import Apart, _Child, _environment, _training_part, fit_apart
 from spike4dgs.benchmark.runs.apart.messages import packed_method, unpacked_method
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
@@ -210,6 +212,53 @@ def test_a_process_that_dies_beside_its_own_child_holds_nobody(small_scene: Path
     cell = cell_of(run(tmp_path / "out", [small_scene], DiesBesideItsChild(child), **APART))
     assert cell["status"] == "failed" and "its end by signal 9" in cell["error"]
     os.kill(int(child.read_text()), signal.SIGKILL)  # it still ran
+
+
+def test_a_last_line_of_a_process_that_dies_while_one_looks_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Through a pipe of a number that `select` does not take."""
+    monkeypatch.setattr("spike4dgs.benchmark.runs.apart.fit._POLL_S", 0.01)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft < 1100:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 1100), hard))
+    low, write = os.pipe()  # open for writing to the end, as where the process has a child of its own
+    read = fcntl.fcntl(low, fcntl.F_DUPFD, 1024)
+    os.close(low)
+
+    class Dying:
+        """A process that says its last line after one has looked for it in vain, and before one asks for its end."""
+
+        stdout, lines = open(read, "rb"), [b'["done", 3]\n']
+
+        def poll(self) -> int:
+            if self.lines:
+                os.write(write, self.lines.pop())
+            return 0
+
+    with Dying.stdout:
+        child = _Child(cast(Any, Dying()), "the process", lambda *_: None, print)
+        assert child.wait("done") == 3 and not child._line()
+    os.close(write)
+
+
+def test_a_model_that_does_not_fit_on_its_own_disk_is_none(small_scene: Path, tmp_path: Path) -> None:
+    """A part of it under its name would count as the model from then on."""
+    other, work = Path("/dev/shm"), tmp_path / "work"
+    if not other.is_dir() or other.stat().st_dev == tmp_path.stat().st_dev:
+        pytest.skip("no second disk here")
+    job = Job(CountMethod(), open_scene(small_scene), 0, "cpu", Budget())
+    (tmp_path / "said").write_text(f'{GOOD}\n["done", null]\n')
+    make = f"mkdir -p {work}/images-0/cam_03; echo > {work}/model.safetensors; cd {work}/images-0"
+    for target in job.scene.targets:
+        make += f"; echo > {target.name}.exr"
+    fits = Apart(f"sh -c '{make}; cat {tmp_path}/said; exec cat > {os.devnull}'")  # in the place of our program
+    with tempfile.TemporaryDirectory(dir=other) as folder:
+        model = Path(folder, "model.safetensors")
+        model.with_name(f".model.{os.getpid()}.part.safetensors").symlink_to("/dev/full")
+        with pytest.raises(UserError, match="model.safetensors: expected room for the file"):
+            fit_apart(job, [tmp_path / "out"], model, work, lambda *_: None, print, fits)
+        assert not list(Path(folder).iterdir()) and not (tmp_path / "out").exists()
+        fit_apart(job, [tmp_path / "out"], model, work, lambda *_: None, print, fits)
+        assert model.is_file() and (tmp_path / "out").is_dir()
 
 
 def caller(out: Path, scene: Path, folder: Path) -> subprocess.Popen[bytes]:
