@@ -12,6 +12,7 @@ import os
 import re
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -66,16 +67,21 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Make a folder, and raise UserError where no file can be written into it: before long work, not after it."""
+    """Raise UserError where no file can be written into a folder, new or not: before long work, not after it.
+
+    A new one is not made: what is still to be looked at may be wrong too.
+    """
     with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".{os.getpid()}.part"
-        probe.touch()
-        probe.unlink()
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+        trial = Path(tempfile.mkdtemp(".part", f".{os.getpid()}.", there))
+        try:
+            (trial / folder.relative_to(there)).mkdir(parents=True, exist_ok=True)
+        finally:
+            shutil.rmtree(trial, ignore_errors=True)
 
 
 def check_file(out: Path) -> None:
-    """Raise UserError where no file `out` can be written: before long work, not after it. Its folder is made."""
+    """Raise UserError where no file `out` can be written: before long work, not after it. No folder is made."""
     if out.is_dir():
         raise problem("--out", "the name of a file", f"the folder {out}", "name a file in it")
     check_writable(out.parent)
@@ -136,13 +142,19 @@ def check_new(folder: Path) -> None:
 def filling(folder: Path) -> Iterator[None]:
     """Fill a new folder; where that fails nothing half written stays there. Raises UserError unless it is new or empty.
 
-    For copies alone: what was recorded is kept, whatever happened.
+    An empty folder that was there stays. For copies alone: what was recorded is kept, whatever happened.
     """
     check_new(folder)
+    there = folder.is_dir()
     try:
         yield
     except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):
+            for path in folder.iterdir() if there else [folder]:
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                elif there:
+                    path.unlink(missing_ok=True)
         raise
 
 

@@ -15,7 +15,7 @@ from spike4dgs.baselines.images.table import IMAGES
 from spike4dgs.baselines.starts.dust3r import estimate as estimate_dust3r
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import check_writable, write_json
+from spike4dgs.benchmark.files import check_file, write_json
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene, open_scenes
@@ -120,7 +120,7 @@ def poses(
         raise problem("--images", f"one of {', '.join((CLIP, FLAT, *IMAGES))}", repr(images), "correct the name")
     opened, rows = open_scenes(scenes, allow_gaps, split), []
     if out:
-        check_writable(out.parent)
+        check_file(out)
     for scene in (as_pinholes(one.training) for one in opened):
         made = _images(scene, images)
         for name in initialization:

@@ -18,7 +18,16 @@ from dummy_methods import CountMethod, run
 from small_scenes import array_cameras
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.files import atomic_path, locked, remove_parts, write_json, writing
+from spike4dgs.benchmark.files import (
+    atomic_path,
+    check_file,
+    check_writable,
+    filling,
+    locked,
+    remove_parts,
+    write_json,
+    writing,
+)
 from spike4dgs.benchmark.scene.images import write_exr, write_mask
 from spike4dgs.benchmark.scene.writer import write_colmap
 from spike4dgs.benchmark.spikes.stream import SpikeWriter
@@ -139,6 +148,34 @@ def test_a_colmap_model_that_is_cut_off_is_noticed(tmp_path: Path) -> None:
         write_colmap(tmp_path / "file", array_cameras(), np.zeros((0, 3)))
 
 
+@pytest.mark.parametrize("there", ["nothing", "a folder", "a link to a folder"])
+def test_a_copy_that_fails_leaves_what_was_there(tmp_path: Path, there: str) -> None:
+    out, target = tmp_path / "out", tmp_path / "target"
+    target.mkdir()
+    if there == "a folder":
+        out.mkdir()
+    elif there == "a link to a folder":
+        out.symlink_to(target)
+    before = sorted(p.name for p in tmp_path.iterdir())
+    with pytest.raises(KeyboardInterrupt), filling(out):
+        write_json(out / "deeper/a.json", {})
+        write_json(out / "b.json", {})
+        raise KeyboardInterrupt
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+    assert not list(target.iterdir()) and not (out.is_dir() and list(out.iterdir()))
+
+
+def test_a_look_whether_one_may_write_makes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    check_writable(tmp_path / "a/b")
+    check_writable(tmp_path)
+    check_file(tmp_path / "c/d/table.md")
+    for wrong in (tmp_path / "file/out", tmp_path / "file", tmp_path / "a" / ("x" * 300)):
+        with pytest.raises(UserError, match="^(?!.*part).*expected (folders on the way|a name that)"):
+            check_writable(wrong)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
 def test_a_run_says_so_before_any_work(small_scene: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     method = CountMethod()
@@ -224,6 +261,8 @@ def test_parts_are_removed_beside_a_process_that_removes_folders(tmp_path: Path)
 def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="/proc/spike4dgs/a.json: expected a folder that may be written to"):
         write_json(Path("/proc/spike4dgs/a.json"), {})
+    with pytest.raises(UserError, match="/proc/spike4dgs: expected a folder that may be written to"):
+        check_writable(Path("/proc/spike4dgs"))
 
 
 def test_weights_on_a_full_disk(tmp_path: Path) -> None:

@@ -183,6 +183,21 @@ def test_a_folder_in_place_of_a_file_is_said_before_the_work(
         assert capsys.readouterr().err.startswith("error: --out: expected the name of a file, found the folder")
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["score", "none", "none", "--out", "new/r.json"],
+        ["worlds", "moon", "--out", "new/w.md"],
+        ["calibrate-rig", "none", "--out", "new/rig"],
+        ["run-benchmark", "none", "--out", "new/out", "--leaderboard", "new/board"],
+    ],
+)
+def test_a_mistyped_name_makes_no_folder(arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_name_that_the_outputs_encoding_lacks_is_escaped(small_scene: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(small_scene, tmp_path / "\u6570\u636e")
     done = python("-m", "spike4dgs.cli", "verify", str(folder), PYTHONIOENCODING="cp1252")

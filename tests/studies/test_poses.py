@@ -71,11 +71,13 @@ def test_a_perfect_network_finds_the_rig_again(calibrated: bool, monkeypatch: py
     assert f"a pose for {small[2].id}, found none" in str(row["error"])
 
 
-def test_unknown_names_are_refused(small_scene: Path) -> None:
+def test_arguments_of_no_use_are_refused_at_once(small_scene: Path) -> None:
     with pytest.raises(UserError, match="names among rig, colmap, dust3r, msdi, matching, matched, found sift"):
         poses((small_scene,), initialization=("sift",))
     with pytest.raises(UserError, match="one of clip, flat, tfp"):
         poses((small_scene,), images="photo")
+    with pytest.raises(UserError, match="--out: expected the name of a file, found the folder"):
+        poses((small_scene,), out=small_scene.parent)
     with pytest.raises(UserError, match="at least one scene folder, found none"):
         poses(())
 
