@@ -217,9 +217,9 @@ def write_entry(
     """Write a record's entry, or keep the one that makes the same claim; return the entry in the leaderboard.
 
     An entry that makes the same claim takes over a better verification, and thumbnails if its own are missing; with
-    `replace` others of both. The caller holds the leaderboard's lock. Raises UserError where the method has another
-    record there that is verified better, or any but a claimed one unless `replace`, and where another method's name
-    differs by case alone.
+    `replace` others of both. Another record of the same method and seed needs `replace`, unless it is verified and the
+    old one is only claimed. The caller holds the leaderboard's lock. Raises UserError where it is needed, where the old
+    record is verified better, and where another method's name differs by case alone.
     """
     name = entry_path(record)
     path = leaderboard / name

@@ -21,6 +21,7 @@ from spike4dgs.benchmark.scene.scene import Scene, TrainingScene, open_scene
 from spike4dgs.benchmark.spikes.folder import NAME as STREAMS
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import SpikeStream
+from spike4dgs.benchmark.untrusted import is_id
 from spike4dgs.method.recordings.camera_facts import CameraFacts, camera_facts
 from spike4dgs.method.recordings.survey import survey_gains, survey_streams
 from spike4dgs.method.starts.plane_sweep import widest_baseline
@@ -82,7 +83,7 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     clock = first.rate_hz, first.n_ticks
     surveyed = survey_streams(
         TrainingScene(
-            _NO_ID.sub("-", root.resolve().name).strip("._-")[:100] or "streams",  # a scene's id, in the model's file
+            scene_id(root.resolve().name),
             streams_revision(streams),
             _guess(names, first),
             tuple(streams[c] for c in names),
@@ -109,6 +110,15 @@ def _without_poses(root: Path, streams: Mapping[str, SpikeStream], seed: int) ->
     )
     facts = camera_facts(training, streams, surveyed.bad)
     return Recording(training, ALL, ESTIMATED, facts, notes=(*surveyed.notes, *notes, *gain_notes))
+
+
+def scene_id(name: str) -> str:
+    """Return the id of a folder's streams, which the model's file has: the folder's name where that is one.
+
+    >>> scene_id("clip_"), scene_id("_my clip!"), scene_id("...")
+    ('clip_', 'my-clip', 'streams')
+    """
+    return name if is_id(name) else _NO_ID.sub("-", name).strip("._-")[:100] or "streams"
 
 
 def streams_revision(streams: Mapping[str, SpikeStream]) -> str:
