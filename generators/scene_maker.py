@@ -286,7 +286,7 @@ def work_key(settings: dict[str, Any], versions: dict[str, str]) -> str:
 
 @cache
 def _sources(world: str) -> str:
-    room, package = __name__.rpartition(".")[0], WORLDS[world].build.__module__.partition(".")[0]
+    room, package = __name__.rpartition(".")[0], WORLDS[world].package
     others = {package} - {room.partition(".")[0]}
     return sources_sha256([sys.modules[name] for name in (room, benchmark.__name__, *others)])
 

@@ -96,7 +96,7 @@ _MOST_READS = 400  # of each camera that are used: all pairs of them are compare
 
 @dataclass(frozen=True)
 class ArrivalFit:
-    """One camera's clock against the computer's. NaN where fewer than three reads ended."""
+    """One camera's clock against the computer's. NaN where fewer than three reads ended, its error with three too."""
 
     camera: str
     drift_ppm: float  # time per tick over the nominal one, less 1; positive: the camera is slow

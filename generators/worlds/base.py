@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,6 +176,14 @@ class World:
     name: str
     title: str
     build: Callable[[int, int, float], WorldScene]
+
+    @property
+    def package(self) -> str:
+        """The package whose code builds it: where `build` is a functools.partial, that of the function in it."""
+        function = self.build
+        while isinstance(function, partial):
+            function = function.func
+        return function.__module__.partition(".")[0]
 
 
 def build_at(world: World, seed: int, variant: int, duration_s: float, speed: float) -> WorldScene:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -205,9 +206,10 @@ def test_code_of_unfinished_work_is_this_room_the_benchmark_and_another_packages
 
     ours = ["spike4dgs.generators", "spike4dgs.benchmark"]
     assert hashed("car") == ours
-    theirs = replace(scene_maker.WORLDS["car"], build=files_in)
-    monkeypatch.setattr(scene_maker, "WORLDS", {"theirs": theirs})
-    assert hashed("theirs") == [*ours, files_in.__module__]
+    car = scene_maker.WORLDS["car"]
+    for theirs in (files_in, partial(files_in), partial(partial(files_in))):
+        monkeypatch.setattr(scene_maker, "WORLDS", {"theirs": replace(car, build=theirs)})
+        assert hashed("theirs") == [*ours, files_in.__module__]
 
 
 def test_unfinished_work_of_other_settings_or_code_is_made_anew(fake, monkeypatch, tmp_path):
