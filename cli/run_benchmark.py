@@ -139,7 +139,8 @@ def run_benchmark(
 ) -> int:
     """Fit methods on scenes, score them, and enter them into a leaderboard. A killed run resumes where it stopped.
 
-    Running other methods on the same scenes with the same --out adds them to the table and the sheets.
+    Running other methods on the same scenes with the same --out, budget and kind of device adds them to the table and
+    the sheets.
 
     Args:
         scenes: Scene folders.

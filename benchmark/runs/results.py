@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spike4dgs.benchmark.environment import device_type
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import visible, write_text
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -77,10 +78,11 @@ def record_paths(run: Path) -> list[Path]:
 def earlier_records(folder: Path, records: Sequence[Record], scenes: Collection[str]) -> tuple[list[Record], list[str]]:
     """Return the records of other methods in a run's `folder` on the run's `scenes`, by id, oldest first.
 
-    They are of the revisions and split of the run's `records`, and have no scene that these lack. All seeds of a method
-    come together, each once. Also return what is left out, a file name and a reason each: other scenes, or no record
-    that this version reads.
+    They are of the revisions and split of the run's `records`, of their budget and kind of device, and have no scene
+    that these lack. All seeds of a method come together, each once. Also return what is left out, a file name and a
+    reason each: other scenes, another budget or device, or no record that this version reads.
     """
+    ours = _ways_to_fit(records)
     names, split = {r["method"]["name"] for r in records}, records[0]["dataset"]["split"]
     revisions = {scene: revision for r in records for scene, revision in r["dataset"]["scenes"].items()}
     found, left_out = [], []
@@ -93,10 +95,14 @@ def earlier_records(folder: Path, records: Sequence[Record], scenes: Collection[
             left_out.append(str(e))
             continue
         same = [scene for scene, revision in record["dataset"]["scenes"].items() if revision == revisions.get(scene)]
-        if record["dataset"]["split"] == split and set(scenes) <= set(same):
-            found.append(of_scenes(record, same))
-        else:
+        if record["dataset"]["split"] != split or not set(scenes) <= set(same):
             left_out.append(f"{path}: other scenes, revisions or split")
+            continue
+        record = of_scenes(record, same)
+        if any(a and b and a != b for a, b in zip(ours, _ways_to_fit([record]), strict=True)):
+            left_out.append(f"{path}: another budget or device")
+            continue
+        found.append(record)
     first: dict[str, str] = {}
     for record in found:
         name, created = record["method"]["name"], str(record["created"])
@@ -107,6 +113,13 @@ def earlier_records(folder: Path, records: Sequence[Record], scenes: Collection[
         return first[method["name"]], method["name"], method["seed"] or 0
 
     return sorted(of_each_seed(found), key=order), left_out
+
+
+def _ways_to_fit(records: Sequence[Record]) -> tuple[set[str], set[str]]:
+    """Return the budgets and the kinds of devices that fitted cells state."""
+    cells = [cell for record in records for cell in record["scenes"].values() if cell["status"] == "ok"]
+    devices = {device_type(cell["device"]) for cell in cells if cell["device"]}
+    return {str(cell["budget"]) for cell in cells if cell["budget"] is not None}, devices
 
 
 def of_each_seed(records: Sequence[Record]) -> list[Record]:

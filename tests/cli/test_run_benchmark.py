@@ -165,6 +165,24 @@ def test_records_that_do_not_belong_there_are_left_out_and_named(
     assert [r["method"] for r in csv.DictReader((out / "results.csv").read_text().splitlines())] == ["quick+counts"]
 
 
+@pytest.mark.parametrize(
+    ("cell", "kept"),
+    [({}, True), ({"budget": 8.0}, False), ({"device": "cuda:0"}, False), ({"budget": None, "device": None}, True)],
+)
+@pytest.mark.usefixtures("installed", "brief")
+def test_records_of_another_budget_or_device_are_in_no_table(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], cell: dict[str, Any], kept: bool
+) -> None:
+    out = tmp_path / "out"
+    go = partial(run_here, (small_scene,), out=out, device="cpu", metrics=("psnr",))
+    go(methods=("counts",))
+    edit_json(out / "results/counts.json", lambda record: record["scenes"]["pattern-0"].update(cell))
+    go(methods=("quick+counts",))
+    rows = [r["method"] for r in csv.DictReader((out / "results.csv").read_text().splitlines())]
+    assert rows == [*(["counts"] if kept else []), "quick+counts"]
+    assert ("results/counts.json: another budget or device" not in " ".join(capsys.readouterr().out.split())) == kept
+
+
 @pytest.mark.usefixtures("installed", "brief")
 def test_a_neighbour_that_no_longer_opens_refuses_no_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It was fitted with --allow-gaps, and the record keeps it."""
