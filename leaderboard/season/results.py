@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -12,7 +11,7 @@ from pathlib import Path
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import locked, read_json, remove_parts, visible, write_json, write_text
 from spike4dgs.benchmark.method import Method, choose_device_for, get_method, make_budget
-from spike4dgs.benchmark.metrics.measure import AUTO, select_metrics
+from spike4dgs.benchmark.metrics.measure import AUTO, mean, select_metrics
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.apart.fit import Apart
@@ -140,16 +139,17 @@ def _order(result: Result) -> tuple[bool, float, str]:
 
 def table_text(season: Season, results: Sequence[Result]) -> str:
     """Return the table of a season: the mean over its scenes, best first. Equal results give equal texts."""
-    scenes = ", ".join(f"`{scene.id}`" for scene in season.scenes)
-    header = ["rank", "method", "submitted as", *(METRICS[m].title for m in _SHOWN), "fit, s"]
+    scenes, few = ", ".join(f"`{scene.id}`" for scene in season.scenes), len(season.scenes)
+    header = ["order", "method", "submitted as", *(METRICS[m].title for m in _SHOWN), "fit, s"]
     about = f"Means over {scenes}; {PROTOCOL['name']}, version {PROTOCOL['version']}."
-    lines = [f"# Season {season.season}", "", about, "", f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
+    note = f"{few} scenes do not tell near rows apart." if few > 1 else "One scene does not tell near rows apart."
+    lines = [f"# Season {season.season}", "", about, note, "", f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
     for position, result in enumerate(results, start=1):
-        rank = str(position) if is_complete(result.record) else "-"
-        seconds = [cell["fit_seconds"] for cell in result.record["scenes"].values()]
-        fit = "-" if None in seconds else f"{math.fsum(seconds):.0f}"
+        order = str(position) if is_complete(result.record) else "-"
+        seconds = mean(cell["fit_seconds"] for cell in result.record["scenes"].values())
+        fit = "-" if seconds is None else f"{seconds:.0f}"
         values = [METRICS[m].format(result.record["mean"][m]) for m in _SHOWN]
-        lines.append(f"| {' | '.join([rank, result.name, result.submitted_as, *values, fit])} |")
+        lines.append(f"| {' | '.join([order, result.name, result.submitted_as, *values, fit])} |")
     return "\n".join(lines) + "\n"
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from spike4dgs.benchmark.runs.predictions import open_predictions
 from spike4dgs.benchmark.runs.run import Settings
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.season import check, predict, reveal, score
-from spike4dgs.leaderboard.season.results import predict_all, read_results, write_result
+from spike4dgs.leaderboard.season.results import predict_all, read_results, table_text, write_result
 from spike4dgs.leaderboard.season.secret_folder import open_committed, scene_folder, training_folder
 
 
@@ -42,14 +43,21 @@ def test_the_psnr_is_that_of_the_files(scored_once: Made) -> None:
         assert result.record["scenes"][scene.id]["metrics"]["psnr"] == pytest.approx(np.mean(values), abs=1e-6)
 
 
-def test_the_table_ranks_by_psnr(scored_once: Made) -> None:
+def test_the_table_is_ordered_by_psnr_and_has_means_over_scenes(scored_once: Made) -> None:
     results = read_results(scored_once.seasons, scored_once.season)
     psnr = [r.record["mean"]["psnr"] for r in results]
     assert psnr == sorted(psnr, reverse=True) and len(psnr) == 2
-    rows = [line for line in (scored_once.public / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
+    slow = replace(results[1], record=copy.deepcopy(results[1].record))
+    for seconds, cell in zip((100.0, 200.0), slow.record["scenes"].values(), strict=True):
+        cell["fit_seconds"] = seconds
+    text = table_text(scored_once.season, [results[0], slow])
+    header, _, *rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert header.startswith("| order | method |") and "2 scenes do not tell near rows apart." in text
     assert [row.split(" | ")[:4] for row in rows] == [
         [f"| {i}", r.name, "predictions", f"{r.record['mean']['psnr']:.2f}"] for i, r in enumerate(results, start=1)
     ]
+    assert header.endswith("| fit, s |") and rows[1].endswith("| 150 |"), "seconds a scene"
+    assert (scored_once.public / "table.md").read_text() == table_text(scored_once.season, results)
 
 
 def test_half_a_result_of_a_killed_process_is_none(scored: Made) -> None:
