@@ -258,16 +258,16 @@ def _code(harness: Mapping[str, Any]) -> str:
 
 
 def standing(boards: Mapping[str, Mapping[str, Any]], path: str) -> str:
-    """Return where the entry at `path` stands, such as "rank 1 of 3 on ideal (release 2, revision ...)"."""
-    found = []
+    """Return where the entry at `path` stands, such as "place 1 of 3 by mean PSNR on ideal (release 2, ...)"."""
+    found, by = [], f"by mean {METRICS[PRIMARY].title}"
     for folder, file in boards.items():
         for board in file["boards"]:
             ranked = sum(row["rank"] is not None for row in board["rows"])
             for row in (r for r in board["rows"] if path in r["entries"]):
-                rank = f"rank {row['rank']} of {ranked}" if row["rank"] else f"not ranked ({reason(row)})"
+                place = f"place {row['rank']} of {ranked} {by}" if row["rank"] else f"not ranked ({reason(row)})"
                 made = ", ".join(f"{scene} {bits:.3%}" for scene, bits in row.get("equivalent", {}).items())
                 other = f", on equivalent scenes (bits that differ: {made})" if made else ""
-                found.append(f"{rank} on {board_name(board, folder, file['release'])}{other}")
+                found.append(f"{place} on {board_name(board, folder, file['release'])}{other}")
     return "; ".join(found) or "not listed"
 
 

@@ -214,14 +214,17 @@ def _enter(verified: Sequence[Verified], leaderboard: Path, replace: bool, refus
                     raise
                 refused.append(str(e))
         boards = write_boards(leaderboard)
-    found = Submitted(refused=refused or [])
+    found, ranked = Submitted(refused=refused or []), False
     for one, entry in entered:
         v = entry["verification"]
         why = f" ({one.missing})" if one.missing and v["label"] == CLAIMED else ""
         if v["label"] != CLAIMED and v["unverified"]:
             why = f" (as claimed, not computed again: {', '.join(v['unverified'])})"
         at = standing(boards, entry_path(one.record))
+        ranked = ranked or at.startswith("place")
         found.standings.append(f"{one.record['method']['name']}: {v['label']}{why}, {at}")
+    if ranked:  # an interval, which takes a comparison with all others
+        found.standings.append(f"ranks, with their intervals: spike4dgs leaderboard --leaderboard {leaderboard}")
     places = [place_of(one.record) for one, _ in entered]
     for folder, reason in dict.fromkeys((p.folder, p.why) for p in places if not p.is_public):
         found.standings.append(f"local board, in {leaderboard / FILES[LOCAL]}, not on a track: {folder}: {reason}")

@@ -54,7 +54,7 @@ def test_results_images_and_entries_stay(small_scene: Path, tmp_path: Path, caps
     out = tmp_path / "out"
     assert run_here((small_scene,), methods=("counts", "quick+counts"), out=out, device="cpu", budget="0.5") == 0
     text = capsys.readouterr().out
-    assert "quick+counts" in text and "Results" in text and "re-scored, rank 1 of" in text
+    assert "quick+counts" in text and "Results" in text and "re-scored, place 1 of 2 by mean PSNR" in text
     for name in ("sheet_pattern-0", "scatter"):
         with Image.open(out / f"{name}.png") as image:
             assert min(image.size) > 300
@@ -75,10 +75,10 @@ def test_ranks_are_printed_once_and_are_the_final_ones_and_a_failed_cell_is_exit
     assert run_here((small_scene,), methods=names, out=tmp_path / "out", device="cpu", metrics=("psnr",)) == 1
     text, errors = capsys.readouterr()
     assert "failed: bad on pattern-0" in errors and "bad (failed)" in text
-    shown = dict(re.findall(r"^(\S+): .*, (rank \d of 2|not ranked) .*on the local board", text, re.MULTILINE))
+    shown = dict(re.findall(r"^(\S+): .*, (place \d of 2|not ranked) .*on the local board", text, re.MULTILINE))
     rows = json.loads((tmp_path / "out/leaderboard/local.json").read_text())["boards"][0]["rows"]
-    assert shown == {r["method"]: f"rank {r['rank']} of 2" if r["rank"] else "not ranked" for r in rows}
-    assert text.index("results.csv") < text.index("rank ") and text.count("rank ") == 2
+    assert shown == {r["method"]: f"place {r['rank']} of 2" if r["rank"] else "not ranked" for r in rows}
+    assert text.index("results.csv") < text.index(", place ") and text.count(", place ") == 2
     assert [r["rank"] for r in rows] == [1, 2, None] and rows[2]["method"] == "bad"
 
 

@@ -62,7 +62,7 @@ def test_a_result_of_equivalent_scenes_is_on_the_track_and_says_so(
 ) -> None:
     data = ship(done, monkeypatch, 1e-4)
     entry = read(enter(done))
-    assert "rank 1 of 1 on patterns (release 2" in (said := said())
+    assert "place 1 of 1 by mean PSNR on patterns (release 2" in (said := said())
     assert "on equivalent scenes (bits that differ: pattern-0 0.0" in said
     dataset = entry["record"]["dataset"]
     own, released = (open_scene(folder / "s0") for folder in (done, data))

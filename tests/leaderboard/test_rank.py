@@ -190,7 +190,7 @@ def test_methods_are_on_the_tracks_that_withhold_nothing_they_are_given(done: Pa
     out = said()
     revision = board(done, "leaderboard")["boards"][0]["revision"][:12]
     assert f"on patterns (release 2, revision {revision})" in out
-    assert f"rank 1 of 1 on unposed (release 2, revision {revision})" in out
+    assert f"place 1 of 1 by mean PSNR on unposed (release 2, revision {revision})" in out
 
 
 def test_the_boards_are_made_from_the_entries_alone(entered: Path) -> None:

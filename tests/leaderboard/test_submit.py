@@ -26,8 +26,9 @@ def test_with_files_an_entry_is_re_scored(done: Path, released: None, said: Any)
     assert entry["verification"]["by"].keys() == {"when", "harness", "environment"}
     revision = board(done, "leaderboard")["boards"][0]["revision"][:12]
     assert path.parent == done / f"board/entries/2-patterns@{revision}"
-    line = f"tfp+4dgs: re-scored, rank 1 of 1 on patterns (release 2, revision {revision})\n"
-    assert said() == line
+    at = f"place 1 of 1 by mean PSNR on patterns (release 2, revision {revision})"
+    ranks = f"ranks, with their intervals: spike4dgs leaderboard --leaderboard {done / 'board'}"
+    assert said() == f"tfp+4dgs: re-scored, {at}\n{ranks}\n"
 
 
 def test_another_revision_is_local_says_why_and_leaves_the_track_alone(
@@ -63,7 +64,8 @@ def test_without_files_an_entry_is_claimed(
     folder = done / "out/predictions" / predictions if predictions else None
     options = {"predictions": folder, "scenes": tuple(done / name for name in scenes)}
     assert read(enter(done, verified=False, **options))["verification"]["label"] == "claimed"
-    assert f"claimed ({reason}), not ranked (nothing was computed again) on the local" in said()
+    assert f"claimed ({reason}), not ranked (nothing was computed again) on the local" in (text := said())
+    assert "ranks, with their intervals" not in text
 
 
 def test_submitting_twice_changes_nothing_and_neither_does_scoring_again(entered: Path) -> None:
@@ -110,7 +112,7 @@ def test_a_refused_record_does_not_stop_the_others(done: Path, capsys: pytest.Ca
     results = {done / f"out/results/{n}.json": done / "out/predictions" / n for n in ("rough", "tfp+4dgs")}
     assert submit_all(results, scenes=(done / "s0", done / "s1"), leaderboard=done / "board") == 1
     captured = capsys.readouterr()
-    assert "expected psnr" in captured.err and "tfp+4dgs: re-scored, rank 1 of 1" in captured.out
+    assert "expected psnr" in captured.err and "tfp+4dgs: re-scored, place 1 of 1 by mean PSNR" in captured.out
     assert captured.out.count("local board, in") == 1
 
 
@@ -144,7 +146,7 @@ def test_a_second_fit_is_compared_and_its_costs_stand_beside_the_claimed_ones(
     (row,) = board(entered)["boards"][0]["rows"]
     costs, seconds = row["costs"]["fit_seconds"], sum(c["fit_seconds"] for c in refit["costs"].values())
     assert row["label"] == "re-fitted" and costs["re-fitted"] == pytest.approx(seconds) != costs["claimed"]
-    assert "tfp+4dgs: re-fitted, rank 1 of 1" in said()
+    assert "tfp+4dgs: re-fitted, place 1 of 1 by mean PSNR" in said()
     assert not list(refits_of(entered / "board").iterdir())
 
 
