@@ -102,6 +102,8 @@ def ranking_table(board: Board, metric: str, width: int) -> Table:
         title=f"{board.name}: {board.title}", box=None, title_justify="left", padding=(0, 0, 0, 1), pad_edge=False
     )
     table.caption = f"rank: simultaneous {LEVEL:.0%} intervals; methods that cannot be told apart tie"
+    if len({row.hardware for row in board.rows if _costs(row.records)[:2] != ["-", "-"]}) > 1:
+        table.caption += "\nFit times and images/s are of different machines: do not compare them."
     for title in (
         "rank",
         "method",

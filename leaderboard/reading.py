@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -123,12 +124,16 @@ def _brief(entry: Entry) -> Entry:
         scene: {
             **{key: value for key, value in cell.items() if key not in _HEAVY["cell"]},
             "metrics": {PRIMARY: cell["metrics"][PRIMARY]},
-            "fitted_with": {"harness": cell["fitted_with"]["harness"]},
+            "fitted_with": {**cell["fitted_with"], "environment": _machine(cell["fitted_with"]["environment"])},
             "per_image": {name: {PRIMARY: values[PRIMARY]} for name, values in cell["per_image"].items()},
         }
         for scene, cell in record["scenes"].items()
     }
     return {**{k: v for k, v in entry.items() if k != KEY}, "record": {**record, "scenes": scenes}}
+
+
+def _machine(environment: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    return environment and {key: environment.get(key) for key in ("cpu", "gpu")}
 
 
 def _file(leaderboard: Path) -> Path:

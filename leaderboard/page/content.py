@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spike4dgs.benchmark.method import DEFAULT_GIVEN
@@ -12,7 +12,7 @@ from spike4dgs.benchmark.reports.paper_tables import published
 from spike4dgs.benchmark.runs.record import COSTS
 from spike4dgs.benchmark.variants import world_of
 from spike4dgs.leaderboard.page.intervals import Comparison
-from spike4dgs.leaderboard.page.rows import Board, Row
+from spike4dgs.leaderboard.page.rows import NOT_STATED, Board, Row, distinct
 from spike4dgs.leaderboard.page.scores import ImageScores, rounded
 from spike4dgs.leaderboard.tracks import PUBLIC, current_release
 
@@ -52,7 +52,7 @@ def board_content(board: Board, identifier: str) -> dict[str, Any]:
                 "revision": (revision := board.dataset["scenes"][s]),
                 "ceiling": release.ceiling_db(s, revision),
                 "sensor": release.sensor(s, revision)
-                or _distinct(r["sensors"][s] for row in board.rows for r in row.records if s in r.get("sensors", {})),
+                or distinct(r["sensors"][s] for row in board.rows for r in row.records if s in r.get("sensors", {})),
             }
             for s in board.scenes
         ],
@@ -77,8 +77,8 @@ def _row(row: Row, scenes: Sequence[str]) -> dict[str, Any]:
         "why": row.why,
         "seeds": [r["method"]["seed"] or 0 for r in row.records],
         "parts": {p: str(params[p]) if isinstance(params.get(p), str) else "none" for p in PARTS},
-        "budget": _distinct(_budget(c["budget"]) for c in fitted),
-        "hardware": _distinct(_machine(c["fitted_with"]["environment"] or {}) for c in fitted),
+        "budget": distinct(_budget(c["budget"]) for c in fitted),
+        "hardware": row.hardware,
         "given": list(method.get("given", DEFAULT_GIVEN)),
         "trainedOn": len(method["trained_on"]),
         "cells": [_cell(of) for of in cells],
@@ -95,16 +95,8 @@ def _cell(seeds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _budget(budget: float | str | None) -> str:
     if budget is None:
-        return "not stated"
+        return NOT_STATED
     return budget if isinstance(budget, str) else f"{budget:g} x quick"
-
-
-def _machine(environment: Mapping[str, Any]) -> str:
-    return str(environment.get("gpu") or environment.get("cpu") or "not stated")
-
-
-def _distinct(texts: Iterable[str]) -> str:
-    return " / ".join(sorted(set(texts))) or "not stated"
 
 
 def published_values(board: Board) -> dict[str, Any] | None:

@@ -31,6 +31,7 @@ from spike4dgs.leaderboard.tracks import (
 
 _NAMED = 4  # scenes that a board's title names
 ENTERED = "leaderboard"  # of a run: where `run-benchmark` enters its records
+NOT_STATED = "not stated"
 OWN = "own run"  # the label of a reader's records, beside those of entries
 
 
@@ -63,6 +64,13 @@ class Row:
     def first(self) -> Record:
         """The record of the first seed."""
         return self.records[0]
+
+    @property
+    def hardware(self) -> str:
+        """The machines of the fits, such as "AMD EPYC, 2 cores"."""
+        cells = [c for r in self.records for c in r["scenes"].values() if c["status"] == "ok"]
+        machines = [c["fitted_with"]["environment"] or {} for c in cells]
+        return distinct(str(m.get("gpu") or m.get("cpu") or NOT_STATED) for m in machines)
 
     @property
     def unverified(self) -> set[str]:
@@ -121,6 +129,11 @@ def gather(
         board.rows[:] = _distinct(board.rows)
     order = (PUBLIC, LOCAL, ARCHIVE)
     return sorted(boards, key=lambda b: order.index(b.folder)), refused
+
+
+def distinct(texts: Iterable[str]) -> str:
+    """Return different texts as one, sorted."""
+    return " / ".join(sorted(set(texts))) or NOT_STATED
 
 
 def _distinct(rows: Sequence[Row]) -> Iterator[Row]:

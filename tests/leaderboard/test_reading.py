@@ -96,6 +96,7 @@ def test_the_page_and_the_ranking_check_nothing_again(board: Path, counts: Count
     whole, brief = (gather(board, (), brief=brief)[0] for brief in (False, True))
     assert counts == {"read_bytes": 2 * FEWEST}
     assert [row.name for row in whole[0].rows] == [row.name for row in brief[0].rows]
+    assert {row.hardware for board in whole for row in board.rows} == {brief[0].rows[0].hardware} != {"not stated"}
     assert whole[0].rows[0].hashes == brief[0].rows[0].hashes
     path, sha256 = next(iter(whole[0].rows[0].hashes.items()))
     assert sha256 == sha256_json(json.loads((board / path).read_text(encoding="utf-8")))

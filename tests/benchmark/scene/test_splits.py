@@ -234,7 +234,8 @@ def test_splits_never_mix_in_a_leaderboard(scene: Path, tmp_path: Path, capsys: 
         result = tmp_path / split / "results/counts.json"
         for _ in range(2):  # the second time changes nothing
             assert not submit_all({result: predictions}, scenes=(scene,), leaderboard=tmp_path / "board")
-            assert "counts: re-scored, place 1 of 1 by mean PSNR on the local board pattern-0 (revision " in capsys.readouterr().out
+            said = capsys.readouterr().out
+            assert "counts: re-scored, place 1 of 1 by mean PSNR on the local board pattern-0 (revision " in said
     boards = json.loads((tmp_path / "board/local.json").read_text())["boards"]
     assert sorted(b["dataset"]["split"] for b in boards) == ["center", "corner"]
     assert len({b["revision"] for b in boards}) == 2

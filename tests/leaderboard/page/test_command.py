@@ -6,7 +6,9 @@ import io
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from page_boards import board, cell, failed, row
 from rich.console import Console
 
 from spike4dgs.benchmark.files import read_json, sha256_json, write_json
@@ -106,6 +108,23 @@ def test_a_run_without_its_scenes_gives_a_page_without_images(
     assert "left out: no images of pattern-0" in out and str(tmp_path / "page/index.html") in out
     assert (tmp_path / "page/data/boards.js").is_file()
     assert {path.name for path in (tmp_path / "page/pictures").iterdir()} == {"sheets"}, "those of published entries"
+
+
+@pytest.mark.parametrize(
+    ("machines", "marked"),
+    [(("a", "a"), False), (("a", "b"), True), (("a", None), True), (("a", "failed"), False), (("failed", "b"), False)],
+)
+def test_times_of_different_machines_are_marked(machines: tuple[str | None, ...], marked: bool) -> None:
+    def made(name: str, machine: str | None) -> rows.Row:
+        environment = machine and {"cpu": machine, "gpu": None}
+        fitted = cell({"psnr": np.full(2, 30.0)}, fitted_with={"environment": environment, "harness": None})
+        return row(name, {"s": failed() if machine == "failed" else fitted})
+
+    found = board("b", [made(f"m{k}", machine) for k, machine in enumerate(machines)])
+    console = Console(file=io.StringIO(), width=200)
+    console.print(ranking_table(found, "psnr", 200))
+    text = " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
+    assert ("Fit times and images/s are of different machines: do not compare them." in text) == marked
 
 
 def test_a_row_stays_on_its_lines_whatever_the_width() -> None:

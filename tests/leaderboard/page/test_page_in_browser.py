@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from devtools import Page, wait_for
-from page_boards import board, cell, failed, large_board, row
+from page_boards import CODE, MACHINE, board, cell, failed, large_board, row
 
 from spike4dgs.benchmark.reports.error_map import error_image
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr
@@ -90,6 +90,17 @@ def flags_board() -> Board:
     return board("flags", [*rows, of("own", 35, "t failed", "own run")])
 
 
+def machines_board() -> Board:
+    """Two rows of one machine, one of another."""
+
+    def of(name: str, psnr: float, machine: str) -> Any:
+        environment = {**MACHINE, "cpu": machine}
+        made = cell({"psnr": np.full(3, psnr)}, fitted_with={"environment": environment, "harness": CODE})
+        return row(name, {"s": made})
+
+    return board("machines", [of("slow", 40, "b"), of("other", 35, "b"), of("quick", 30, "a")])
+
+
 def sheets_board(finished: Path, folder: Path) -> Board:
     """The entries of a run, which have thumbnails, without the run."""
     names = ("tfp+4dgs", "rough")
@@ -112,7 +123,7 @@ def written(finished: Path, data: Path, tmp_path_factory: pytest.TempPathFactory
     out = tmp_path_factory.mktemp("page") / "page"
     boards, refused = gather(COMMITTED, (finished / "out",))
     sheets = sheets_board(finished, tmp_path_factory.mktemp("sheets") / "board")
-    made = [seeds_board(), sensors_board(), hostile_board(), labels_board(), flags_board(), sheets]
+    made = [seeds_board(), sensors_board(), hostile_board(), labels_board(), flags_board(), machines_board(), sheets]
     return out, write_site(out, [*boards, *made], [*refused, {"entry": HOSTILE, "reason": HOSTILE}], data)
 
 
@@ -206,6 +217,16 @@ def test_filters_count_what_they_hide_and_live_in_the_address(page: Page, commit
     assert "tfi+4dgs" not in names(page) and "spike4dgs" in names(page)
     click(page, "document.querySelector('#count button')")
     assert page.value("location.hash") == "#t=ideal" and len(names(page)) == shown + hidden
+
+
+def test_times_of_different_machines_are_marked(page: Page) -> None:
+    marked = []
+    for state, shown in (("", "slow other quick"), ("&hardware=b", "slow other"), ("&q=quick", "quick")):
+        go(page, f"t=machines{state}")
+        assert names(page) == shown.split()
+        caption = page.value("document.querySelector('#table caption').textContent")
+        marked.append("Fit times and images/s are of different machines: do not compare them." in caption)
+    assert marked == [True, False, False]
 
 
 def test_the_address_restores_everything(page: Page) -> None:

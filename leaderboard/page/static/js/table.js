@@ -49,8 +49,11 @@ Spike4DGS.table = (() => {
     rest = () => body.append(...rows.slice(SCREEN).map(line));
     const ranked = `ranks by ${heading(metric)} among the rows shown, with ${Math.round(100 * page.bootstrap.level)} % intervals that hold `
       + "together; methods that cannot be told apart tie (=).";
+    const timed = view.shown.filter(({ values }) => values.fit_seconds !== null || values.render_fps !== null);
+    const machines = new Set(timed.map(({ row }) => row.hardware));
     const caption = el("caption", {}, el("div", {}, `Means over ${plural(view.scenes.length, "scene")}; `,
-      view.board.scored.length ? ranked : "no row of this board is ranked."));
+      view.board.scored.length ? ranked : "no row of this board is ranked.",
+      machines.size > 1 && " Fit times and images/s are of different machines: do not compare them."));
     // The page keeps its height meanwhile: what is read further down does not jump.
     if (rows.length > SCREEN) byId("scroller").style.minHeight = `${byId("scroller").offsetHeight}px`;
     fill(byId("table"), caption, head, body);
