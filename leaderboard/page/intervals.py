@@ -163,7 +163,7 @@ def joint_value(methods: int) -> float:
     """Return Bonferroni's critical value of a normal number for all pairs of so many methods, of four digits.
 
     >>> joint_value(2), joint_value(24)
-    (1.96, 3.746)
+    (1.96, 3.744)
     """
     from scipy.special import ndtri
 
