@@ -133,7 +133,7 @@ def _brief(entry: Entry) -> Entry:
 
 
 def _machine(environment: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    return environment and {key: environment.get(key) for key in ("cpu", "gpu")}
+    return {key: environment.get(key) for key in ("cpu", "gpu")} if environment else None
 
 
 def _file(leaderboard: Path) -> Path:
