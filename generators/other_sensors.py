@@ -110,7 +110,7 @@ class EventNoise:
     mismatch: float = 0.05  # standard deviation of a pixel's thresholds, of log radiance
     shot_hz: float = 5.0  # events of a black pixel a second, half of them positive; they change no stored radiance
     shot_bright: float = 0.25  # of that at white
-    refractory_us: float = 500.0  # after a change's event, in which others send none but are stored; shot events come
+    refractory_us: float = 500.0  # after a change's event: no others, and what changes is told later; shot events come
 
 
 _LEAST_THRESHOLD = 0.01  # as in v2e
@@ -143,7 +143,8 @@ def events(
             break
         after = _log(keys[k])
         span_us = np.array([key_ticks[k - 1], key_ticks[k]]) * 1e6 / rate_hz
-        room = int(np.ceil(np.abs(after - level) / least).sum()) + 1
+        # up to where the light was, for an event that waits, then on to where it goes: they may be opposite ways
+        room = int(np.ceil((np.abs(before - level) + np.abs(after - before)) / least).sum()) + 1
         t, pixel, p = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.uint8)
         lines, last = (before.ravel(), after.ravel(), level.ravel()), (last_us, refractory_us)
         n = crossings(*lines, span_us[0], span_us[1], thresholds, *last, t, pixel, p)
@@ -192,27 +193,33 @@ def crossings(
 ) -> int:
     """Fill t, pixel and p with the events of one interval, pixel by pixel; advance the state; return their number.
 
-    before, after: log radiance [P] at the start and at the end. State: `level`, the log radiance of the last crossing,
-    and `last_us`, the time of the last event [P]. thresholds: [2, P], of darker and of brighter.
+    before, after: log radiance [P] at the start and at the end. State: `level`, the log radiance that the events have
+    told, and `last_us`, the time of the last event [P]. thresholds: [2, P], of darker and of brighter.
+    A pixel that is still a threshold away when its refractory period ends sends an event at once.
     """
     n = 0
     for i in range(len(before)):
         a, b = before[i], after[i]
-        if a == b:
-            continue
-        brighter = b > a
-        sign = 1.0 if brighter else -1.0
-        step = sign * thresholds[1 if brighter else 0, i]
-        while (b - level[i] - step) * sign >= 0.0:
-            level[i] += step
-            share = (level[i] - a) / (b - a)
-            share = min(max(share, 0.0), 1.0)  # round-off at the ends
-            now = start_us + share * (end_us - start_us)
-            if now - last_us[i] < refractory_us:
-                continue
+        free = max(start_us, last_us[i] + refractory_us)
+        while free < end_us or (refractory_us == 0.0 and free <= end_us):
+            at = a + (b - a) * ((free - start_us) / (end_us - start_us))
+            if refractory_us > 0.0 and at - level[i] >= thresholds[1, i]:  # it has waited for the pixel
+                brighter, now = True, free
+            elif refractory_us > 0.0 and level[i] - at >= thresholds[0, i]:
+                brighter, now = False, free
+            else:
+                if a == b:
+                    break
+                brighter = b > a
+                sign = 1.0 if brighter else -1.0
+                step = sign * thresholds[1 if brighter else 0, i]
+                if (b - level[i] - step) * sign < 0.0:
+                    break
+                share = min(max((level[i] + step - a) / (b - a), 0.0), 1.0)  # round-off at the ends
+                now = max(start_us + share * (end_us - start_us), free)
+            level[i] += thresholds[1, i] if brighter else -thresholds[0, i]
             last_us[i] = now
-            t[n] = np.int64(now)
-            pixel[n] = i
-            p[n] = 1 if brighter else 0
+            t[n], pixel[n], p[n] = np.int64(now), i, 1 if brighter else 0
             n += 1
+            free = now + refractory_us
     return n
