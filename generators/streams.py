@@ -138,5 +138,5 @@ def extras(job: Job) -> dict[str, dict[str, Any]]:
         },
         "conventional": {"fps": FPS, "exposure_s": EXPOSURE_S, "coding": "8-bit sRGB gray"} | frames,
         "events": {"threshold": THRESHOLD, "columns": "t (us), x, y, p (1: brighter)"} | noise,
-        "calibration": calibration.calibration_facts(),
+        "calibration": calibration.calibration_facts(radiance_gain(job)),
     }

@@ -25,6 +25,8 @@ from spike4dgs.benchmark.spikes.counted_recording import Recording, first_last_t
 from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import open_stream
 
+_MOST_SATURATED = 0.05  # share of the pixels; twice the usual light saturates up to 0.008 of them, 2.2 times 0.1
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recordings(Shown):
@@ -98,14 +100,19 @@ class Calibration(Shown):
 def estimate(recordings: Recordings) -> Calibration:
     """Return the gain and dark maps of a camera. A pixel that never fires under uniform light is dead: its gain is 0.
 
-    Raises UserError where the recordings do not fit together, or where no pixel responds to the light.
+    Raises UserError where the recordings do not fit together, where no pixel responds to the light, or where many are
+    saturated: a pixel that fires in every tick tells nothing of its sensitivity.
     """
     flat, dark = recordings.flat, recordings.dark
     if (flat.width, flat.height) != (dark.width, dark.height) or recordings.flat_radiance <= 0:
         found = f"{flat.width}x{flat.height}, {dark.width}x{dark.height} and radiance {recordings.flat_radiance:g}"
         raise problem("calibration", "two recordings of one size and a positive radiance", found, "correct them")
+    spikes = total_counts(flat)
+    if (saturated := float((spikes == flat.n_ticks).mean())) > _MOST_SATURATED:
+        found, again = f"{saturated:.0%} of the pixels fire in every tick", "record it again in dimmer light"
+        raise problem("flat-field recording", f"at most {_MOST_SATURATED:.0%} saturated pixels", found, again)
     dark_rate = rates(dark)
-    light = np.where(total_counts(flat) > 0, np.maximum(rates(flat) - dark_rate, 0), 0)
+    light = np.where(spikes > 0, np.maximum(rates(flat) - dark_rate, 0), 0)
     if not (mean := float(light.mean())) > 0:
         raise problem("flat-field recording", "light", "no more spikes than in the dark", "record it again")
     return Calibration((light / mean).astype(np.float32), dark_rate.astype(np.float32), mean / recordings.flat_radiance)

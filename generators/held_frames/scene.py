@@ -117,7 +117,7 @@ def write_held_frames(
             targets=tuple(Target(holding.held_out, _middle(k, hold)) for k in range(len(chosen))),
             sensor=noisy_facts(),
             source=source,
-            extras={"calibration": calibration_facts()},
+            extras={"calibration": calibration_facts(SENSOR.radiance_gain)},
         )
         finish_scene(out, description)
     return source

@@ -56,14 +56,20 @@ def _rng(name: str, seed: int, camera: str) -> np.random.Generator:
     return np.random.default_rng([seed, *f"{camera} {name}".encode()])
 
 
-FLAT_RADIANCE = 0.7
+FLAT_RADIANCE = 0.7  # at most
+_FLAT_SPIKES = 0.84  # a tick, at most: from some 0.9 on many pixels fire in every tick, and hide their sensitivity
 FLAT_TICKS = 500  # 25 ms
 DARK_TICKS = 2000  # 100 ms: the darkest hundredth of the pixels fires every 670 ticks
 
 
-def calibration_facts() -> dict[str, Any]:
-    """Return `calibration` of scene.json for the recordings of `write_calibration`."""
-    return {"flat_radiance": FLAT_RADIANCE, "flat_ticks": FLAT_TICKS, "dark_ticks": DARK_TICKS}
+def flat_radiance(radiance_gain: float) -> float:
+    """Return the radiance of the uniform light of a recording: dimmer where a camera gets more than twice the light."""
+    return min(FLAT_RADIANCE, _FLAT_SPIKES / radiance_gain)
+
+
+def calibration_facts(radiance_gain: float) -> dict[str, Any]:
+    """Return `calibration` of scene.json for the recordings of `write_calibration`, of sensors of this gain."""
+    return {"flat_radiance": flat_radiance(radiance_gain), "flat_ticks": FLAT_TICKS, "dark_ticks": DARK_TICKS}
 
 
 def noisy_sensor(camera: Camera, seed: int, noise_seed: Sequence[int]) -> Sensor:
@@ -89,7 +95,8 @@ def noisy_facts() -> dict[str, Any]:
 
 def write_calibration(folder: Path, camera: Camera, sensor: Sensor, entropy: Sequence[int]) -> None:
     """Record folder/flat/CAM.dat and folder/dark/CAM.dat with a simulated camera; `entropy`: of initial charges."""
-    for name, radiance, n_ticks in (("flat", FLAT_RADIANCE, FLAT_TICKS), ("dark", 0.0, DARK_TICKS)):
+    light = flat_radiance(sensor.radiance_gain)
+    for name, radiance, n_ticks in (("flat", light, FLAT_TICKS), ("dark", 0.0, DARK_TICKS)):
         keys = [np.full((camera.height, camera.width), radiance, np.float32)] * 2
         charge = random_charge(camera.height, camera.width, [*entropy, *name.encode()])
         noise = (*sensor.noise_seed, *name.encode())

@@ -22,7 +22,7 @@ from spike4dgs.generators.physics import CAMERAS, Physics, PhysicsOptions, from_
 from spike4dgs.generators.profiles import PROFILES, Job
 from spike4dgs.generators.render_tasks import cameras_of, recorded_job, world_of
 from spike4dgs.generators.scene_maker import Maker
-from spike4dgs.generators.streams import sensor_of
+from spike4dgs.generators.streams import extras, sensor_of
 
 JOB = Job("car", 0, 0, "tiny", PROFILES["tiny"], PROFILES["tiny"].seconds)
 PLAIN = replace(JOB, world="blank")  # takes no time to build
@@ -215,6 +215,11 @@ def test_a_warm_sensor_doubles_its_dark_rate_in_the_clip_and_not_in_the_calibrat
     counts = [open_stream(f / "spikes/cam_00.dat", 64, 40, 2e4, rows_bottom_up=True).counts(0, 80) for f in folders]
     added = np.mean(counts[1].astype(int) - counts[0]) / 80
     assert added == pytest.approx(sensor_of(JOB, cameras_of(JOB)[0]).dark.mean(), rel=0.1)
+
+
+def test_a_scene_states_the_light_of_its_flat_recording():
+    for light, radiance in ((0.25, 0.7), (2, 0.7), (4, 0.35)):
+        assert extras(job(light=light))["calibration"]["flat_radiance"] == pytest.approx(radiance)
 
 
 def test_a_stopped_down_lens_scales_light_and_neither_the_dark_rate_nor_the_truth(ideal, made):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def recordings(folder, sensor):
     camera = look_at("cam_00", np.array([0, -3.0, 1]), np.zeros(3), up, focal=200, width=WIDTH, height=HEIGHT)
     calibration.write_calibration(folder, camera, sensor, [1, 2])
     flat, dark = (open_stream(folder / name / "cam_00.dat", WIDTH, HEIGHT, 2e4) for name in ("flat", "dark"))
-    return Recordings(flat, dark, calibration.FLAT_RADIANCE)
+    return Recordings(flat, dark, calibration.calibration_facts(sensor.radiance_gain)["flat_radiance"])
 
 
 def real_sensor(pixels):
@@ -58,6 +59,29 @@ def test_maps_are_recovered_from_a_scenes_recordings(tmp_path):
     assert found.radiance_gain == pytest.approx(0.6, rel=1e-3)
     counted = flat.counts(0, flat.n_ticks) / flat.n_ticks - dark.counts(0, dark.n_ticks) / dark.n_ticks
     assert rms(found.gain, sensor.gain) < 0.5 * rms(counted / counted.mean(), sensor.gain)  # better than counting
+
+
+@pytest.mark.parametrize(("light", "radiance"), [(0.25, 0.7), (2, 0.7), (4, 0.35), (16, 0.0875)])
+def test_maps_are_recovered_whatever_light_reaches_the_sensor(tmp_path, light, radiance):
+    """Under radiance 0.7, four times the light makes every pixel fire in every tick: no map, and a gain of 1.42."""
+    sensor = replace(real_sensor((HEIGHT, WIDTH, 0, "cam_00")), radiance_gain=0.6 * light)
+    made = recordings(tmp_path, sensor)
+    assert made.flat_radiance == pytest.approx(radiance)
+    found = estimate(made)
+    assert rms(found.gain, sensor.gain) < 0.01 and found.radiance_gain == pytest.approx(0.6 * light, rel=2e-3)
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.04, False), (0.08, True)])
+def test_a_recording_of_saturated_pixels_is_refused(share, refused):
+    rng = np.random.default_rng(0)
+    spikes, none = rng.random((60, 8, 25)) < 0.5, np.zeros((60, 8, 25))
+    spikes[:, rng.permutation(200).reshape(8, 25) < 200 * share] = True
+    made = Recordings(*(SpikeStream(pack(found), 25, 8, 2e4) for found in (spikes, none)), 0.7)
+    if refused:
+        with pytest.raises(UserError, match="at most 5% saturated pixels, found 8% .* every tick; .* dimmer light"):
+            estimate(made)
+    else:
+        assert estimate(made).gain.mean() == pytest.approx(1)
 
 
 def test_an_ideal_camera_comes_out_flat_and_dark(tmp_path):
