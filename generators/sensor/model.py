@@ -21,8 +21,9 @@ charge plus read_noise times such a g, so a spike comes early or late, but the c
 error does not add up. With dead ticks a pixel collects no light for so long after its charge has crossed the threshold,
 from the very moment inside the tick. A charge that takes 1 / x ticks to fill then gives intervals of dead_ticks + 1 / x
 in the mean: the rate is x / (1 + x dead_ticks), and light is proportional to 1 / (interval - dead_ticks). With one dead
-tick x has no limit below MOST_CHARGE thresholds a tick, and bright pixels may fire in adjacent ticks. The readout clock
-couples into the comparator: a crossing of the threshold a ticks before the tick ends takes the charge
+tick x has no limit below MOST_CHARGE thresholds a tick, and bright pixels may fire in adjacent ticks. A clip begins
+amid such intervals: pixels are in all phases of them, as if the light of the first key had been there before. The
+readout clock couples into the comparator: a crossing of the threshold a ticks before the tick ends takes the charge
 1 - clock_ripple w(a), w(a) = 6 sqrt(3) a (1 - a) (1 - 2 a), a cubic like a sine with extremes 1 and -1. A crossing near
 a tick's border moves away from it, so pixels lock: where a charge of x a tick takes 1 / x within about clock_ripple / x
 of a whole number of ticks, every interval has that number. The mean of w is 0, and light keeps its law elsewhere.
@@ -57,13 +58,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spike4dgs.benchmark.arrays import Float32, Int32, UInt8
+from spike4dgs.benchmark.arrays import Float32, Float64, Int32, UInt8
 from spike4dgs.benchmark.environment import available_cores
 from spike4dgs.benchmark.errors import problem
-from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD
+from spike4dgs.benchmark.spikes.sensor_model import SENSOR, THRESHOLD, charge_of_tick
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 from spike4dgs.generators.sensor.kernels import BLOCK, STRIP, integrate
-from spike4dgs.generators.sensor.uneven_kernels import integrate_uneven
+from spike4dgs.generators.sensor.uneven_kernels import integrate_uneven, steady_start
 
 Keys = Sequence[Float32] | Float32  # K images [H, W]; read one at a time, in order, so a lazy sequence is enough
 
@@ -140,7 +141,8 @@ def simulate(
 
     `keys[k]` is the radiance [H, W] at the start of tick `key_ticks[k]`; key 0 is at tick 0, the last at or after
     `n_ticks`. With `means`, key k is the mean radiance of tick k instead: one key for each tick, no interpolation.
-    `charge` [H, W] is the charge before the first tick (`random_charge`); it is not changed.
+    `charge` [H, W] is the charge before the first tick (`random_charge`); it is not changed. With dead ticks it is the
+    share that is over of a pixel's interval.
     Only one batch of keys (16 MiB, at least four keys) is held at a time. The bytes do not depend on `threads`
     (default: all cores of the process). Raises UserError for keys, ticks or maps that do not fit together, and for
     radiance that is not finite.
@@ -154,8 +156,9 @@ def simulate(
     blocks = -(-height * width // BLOCK)
     state = np.zeros(blocks * BLOCK, dtype=np.int32)
     head, unit, noise = _noise_units(sensor)
+    level, left = _start(keys, sensor, charge)
     # without noise `unit` is 2^31 and this changes nothing
-    _store((charge * (unit / THRESHOLD) + head * unit).astype(np.int32), state)
+    _store((level * (unit / THRESHOLD) + head * unit).astype(np.int32), state)
     gain, dark = _stored_map(sensor.gain, 1.0, blocks), _stored_map(sensor.dark, 0.0, blocks)
     per_batch = max(1, _BATCH_BYTES // (4 * len(state)))
     n_intervals = int(np.searchsorted(ticks, n_ticks))
@@ -167,6 +170,7 @@ def simulate(
     if sensor.is_uneven:
         state = state.astype(np.int64)
         top, rest = np.int64(head * unit + unit if sensor.dead_ticks else THRESHOLD), np.zeros(len(state))
+        _store(left, rest)
         more = _steps(sensor.read_noise, unit), top, float(sensor.dead_ticks), sensor.clock_ripple * unit, rest
     with ThreadPoolExecutor(threads) as pool:
         for first in range(0, n_intervals, per_batch):
@@ -181,6 +185,17 @@ def simulate(
             for job in jobs:
                 job.result()
             yield words.view(np.uint8)[:, : bytes_per_tick(width, height)]
+
+
+def _start(keys: Keys, sensor: Sensor, charge: Int32) -> tuple[NDArray[Any], Float64]:
+    """Return the charge [H, W] before the first tick, in units of 2^-31, and how many dead ticks are left."""
+    if not sensor.dead_ticks:
+        return charge, np.zeros(charge.shape)
+    light = sensor.radiance_gain * _key(keys, 0, charge.shape).astype(np.float64)
+    light = light if sensor.gain is None else light * sensor.gain
+    gathered = charge_of_tick(light, 0.0 if sensor.dark is None else sensor.dark, MOST_CHARGE + sensor.most_over)
+    level, left = steady_start(charge / THRESHOLD, gathered, sensor.dead_ticks)
+    return level * THRESHOLD, left
 
 
 def _noise_units(sensor: Sensor) -> tuple[float, float, np.int32]:
@@ -239,12 +254,16 @@ def _fill(window: Float32, keys: Keys, first: int, last: int, n_keys: int, shape
         window[:3] = window[-3:]
     for row in range(kept, last - first + 3):
         k = min(max(first - 1 + row, 0), n_keys - 1)
-        image = np.asarray(keys[k], dtype=np.float32)
-        if image.shape != shape:
-            raise problem(f"key frame {k}", f"[H, W] = {shape}", str(image.shape), "use one resolution for all")
-        if not np.isfinite(image).all():  # as an integer charge it would be any number
-            raise problem(f"key frame {k}", "finite radiance", "NaN or infinity", "render it again")
-        _store(image, window[row])
+        _store(_key(keys, k, shape), window[row])
+
+
+def _key(keys: Keys, k: int, shape: tuple[int, ...]) -> Float32:
+    image = np.asarray(keys[k], dtype=np.float32)
+    if image.shape != shape:
+        raise problem(f"key frame {k}", f"[H, W] = {shape}", str(image.shape), "use one resolution for all")
+    if not np.isfinite(image).all():  # as an integer charge it would be any number
+        raise problem(f"key frame {k}", "finite radiance", "NaN or infinity", "render it again")
+    return image
 
 
 def _tangent_weights(ticks: NDArray[np.int64]) -> Float32:

@@ -46,8 +46,13 @@ def tick_means(keys: Keys, key_ticks: Sequence[int], n_ticks: int) -> Iterator[F
             yield np.clip((a + b) / 2, np.minimum(p1, p2), np.maximum(p1, p2))
 
 
-def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tuple[NDArray[np.bool_], Float64]]:
-    """Yield spikes [H, W] of each tick and the charge before the reset, from mean radiances and the initial charge."""
+def fire(
+    means: Iterator[Float64], sensor: Sensor, charge: Int32, before: Float32 | None = None
+) -> Iterator[tuple[NDArray[np.bool_], Float64]]:
+    """Yield spikes [H, W] of each tick and the charge before the reset, from mean radiances and the initial charge.
+
+    `before`: radiance in which pixels with dead ticks came to their initial charge; None: all are awake.
+    """
     sd = sensor.spent_sd
     height, width = charge.shape
     pixels = np.arange(height * width, dtype=np.uint64).reshape(height, width)[::-1]  # as the file numbers them
@@ -55,6 +60,12 @@ def fire(means: Iterator[Float64], sensor: Sensor, charge: Int32) -> Iterator[tu
     gain = 1.0 if sensor.gain is None else _exact(sensor.gain)
     dark = 0.0 if sensor.dark is None else _exact(sensor.dark)
     rest, most = np.zeros(charge.shape), MOST_CHARGE if sensor.dead_ticks else 1  # rest: dead ticks that are left
+    if sensor.dead_ticks and before is not None:  # an interval has a rest, then ticks that gather
+        light = gain * sensor.radiance_gain * _exact(before)
+        ticks = 1 / np.maximum(charge_of_tick(light, dark, most + sensor.most_over), 1e-30)
+        ago = level * (sensor.dead_ticks + ticks)  # since the rest began
+        rest = np.maximum(sensor.dead_ticks - ago, 0)
+        level = np.maximum(ago - sensor.dead_ticks, 0) / ticks
     for tick, mean in enumerate(means):
         awake = np.maximum(1 - rest, 0.0)  # share of the tick
         added = charge_of_tick(gain * sensor.radiance_gain * mean, dark, most + sensor.most_over)
@@ -93,5 +104,5 @@ def simulate_reference(
 ) -> NDArray[np.bool_]:
     """Return spikes [n_ticks, H, W], upright and unpacked; the arguments are those of `sensor.model.simulate`."""
     if means:
-        return np.stack([fired for fired, _ in fire((_exact(key) for key in keys), sensor, charge)])
-    return np.stack([fired for fired, _ in fire(tick_means(keys, key_ticks, n_ticks), sensor, charge)])
+        return np.stack([fired for fired, _ in fire((_exact(key) for key in keys), sensor, charge, keys[0])])
+    return np.stack([fired for fired, _ in fire(tick_means(keys, key_ticks, n_ticks), sensor, charge, keys[0])])

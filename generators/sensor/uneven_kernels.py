@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.spikes.bits import kernel
+from spike4dgs.benchmark.spikes.sensor_model import fired
 from spike4dgs.generators.sensor.kernels import BLOCK, _along, _equal, _prepare, _steady, deviate, mix
 
 READ_SALT = 0x7F4A7C15  # the comparator's random numbers are others than those of the charge
@@ -24,6 +26,18 @@ def wave(ago: Any) -> Any:
 
 
 _wave = kernel(wave)
+
+
+def steady_start(phase: Float64, gathered: Float64, dead: float) -> tuple[Float64, Float64]:
+    """Return the charge of pixels in steady light, in thresholds, and how many of their dead ticks are left.
+
+    phase: [H, W] in [0, 1), the share that is over of a pixel's cycle, first its rest and then its gathering;
+    gathered: [H, W], the charge of a tick without rest.
+    """
+    asleep = dead * fired(gathered, dead)  # share of a cycle
+    rests = phase < asleep
+    left = np.where(rests, dead * (1 - phase / np.where(rests, asleep, 1.0)), 0.0)
+    return np.where(rests, 0.0, (phase - asleep) / (1 - asleep)), left
 
 
 @kernel

@@ -428,6 +428,17 @@ def test_dead_ticks_add_to_every_interval(rate, dead):
     assert spikes.mean() == pytest.approx(rate / (1 + rate * dead), rel=0.002)
 
 
+@pytest.mark.parametrize(("radiance", "dead"), [(0.6, 1), (0.2, 2), (0.6, 10), (3.0, 0.5), (0.0, 3)])
+def test_a_clip_with_dead_ticks_begins_in_steady_light(radiance, dead):
+    """Pixels begin in all phases of rest and gathering: no tick of the clip is brighter than another."""
+    light, sensor = np.full((80, 250), radiance, np.float32), Sensor(dead_ticks=dead)
+    s = stream([light, light], [0, 60], 60, sensor, random_charge(80, 250, [3]))
+    rate = 0.6 * radiance / (1 + dead * 0.6 * radiance)
+    ticks = np.array([s.counts(t, t + 1).mean() for t in range(60)])
+    assert ticks == pytest.approx(rate, abs=5 * np.sqrt(rate * (1 - rate) / light.size))
+    assert ticks[:40].mean() == pytest.approx(rate, rel=0.005)
+
+
 @pytest.mark.parametrize(("n", "ripple"), [(3, 0.01), (5, 0.004), (5, 0.01)])
 def test_a_ripple_locks_pixels_to_whole_intervals_and_leaves_the_mean_rate(n, ripple):
     """Pixels whose charge takes 1 / x ticks lock where |1 / x - n| < ripple / x: no phase is pushed farther back."""
