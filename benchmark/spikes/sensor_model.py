@@ -32,7 +32,9 @@ class SensorModel:
     most_spikes_per_tick: int = 1  # one bit a pixel is read out
     radiance_gain: float = 0.6  # spikes per tick of a pixel that sees white; above 1 a pixel is saturated
 
-    photons_per_spike: float = 5e4  # half and twice as many miss the real camera's intervals by more than 20 %
+    # An effective number, fitted to a real camera's intervals: half and twice as many miss them by more than 20 %.
+    # The capacitance that docs/sensor.md gives for reset noise would give 30,000 electrons.
+    photons_per_spike: float = 5e4
     noise_cutoff: float = 3.46  # standard deviations; beyond it Gaussian shot noise is clipped
 
     gain_spread: float = 0.058  # standard deviation over the chip, most of it a smooth shading
