@@ -17,6 +17,7 @@ _STEP_S = 1e-6  # short against every motion here, long against float64 round-of
 COARSE_PX = 2.5  # largest motion between two coarse keys; `visibility` grows moving objects by more, 3 px
 _MOST_SUB_TICKS = 8
 _GRID = 9  # points each way
+_NARROW_PX = 1.55  # a disc 2**0.5 px wide has a pixel's centre wherever it is; coarse meshes of one are 8 % narrower
 
 
 def max_image_speed(
@@ -86,6 +87,40 @@ def carried(world: WorldScene, hits: Hits, points: np.ndarray, from_s: float, to
             shift = surface.vertices(to_s)[corners] - surface.vertices(from_s)[corners]  # [K, 3 corners, xyz]
             out[mine] = points[mine] + np.einsum("kc,kcx->kx", weights, shift)
     return out
+
+
+def object_numbers(world: WorldScene, hits: Hits) -> np.ndarray:
+    """Return the numbers, from 1, of the objects that were hit; each body of a surface is an object."""
+    first = len(world.instances) + 1
+    numbers = hits.number.astype(np.int64) + 1
+    for k, surface in enumerate(world.deforming.values(), start=len(world.instances)):
+        mine = hits.number == k
+        bodies = np.zeros(len(surface.part.mesh.faces), np.int64) if surface.bodies is None else surface.bodies
+        numbers[mine] = first + bodies[hits.face[mine]]
+        first += int(bodies.max()) + 1
+    return numbers
+
+
+def narrow_corners(
+    world: WorldScene, cameras: Sequence[Camera], from_s: float, to_s: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where the corners of bodies are at `from_s` that may lie between the centres of pixels.
+
+    Flat pixels [K] of the views, distances [K] from the cameras, and the motion [K] across the image until `to_s`, px.
+    """
+    pixels, distances, motions = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
+    for surface in (s for s in world.deforming.values() if s.bodies is not None):
+        now, later = surface.vertices(from_s), surface.vertices(to_s)
+        for view, camera in enumerate(cameras):
+            uv, z = camera.project(now)
+            inside = (z > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+            some = np.flatnonzero(inside & (surface.corner_widths * camera.fx < _NARROW_PX * z))
+            if len(some):
+                column, row = uv[some].astype(np.int64).T
+                pixels.append((view * camera.height + row) * camera.width + column)
+                distances.append(np.linalg.norm(now[some] - camera.center, axis=1))
+                motions.append(np.linalg.norm(camera.project(later[some])[0] - uv[some], axis=1))
+    return np.concatenate(pixels), np.concatenate(distances), np.concatenate(motions)
 
 
 @dataclass(frozen=True)

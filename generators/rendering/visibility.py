@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from spike4dgs.benchmark.scene.cameras import Camera
-from spike4dgs.generators.rendering.image_motion import carried, imaged, mirrored
+from spike4dgs.generators.rendering.image_motion import carried, imaged, mirrored, narrow_corners, object_numbers
 from spike4dgs.generators.rendering.mitsuba_scene import Hits, MitsubaScene
 from spike4dgs.generators.worlds import WorldScene
 
@@ -103,9 +103,13 @@ class Visibility:
         return out.reshape(*self.shape, 3)
 
     def traced(self, t_s: float) -> np.ndarray:
-        """Return bool: within 3 px of a pixel that sees, directly or reflected, a moving object or its shadow."""
+        """Return bool: within 3 px of a pixel that sees, directly or reflected, a moving object or its shadow.
+
+        Bodies so narrow that rays through pixel centres may miss them are seen where their corners are.
+        """
         snapshot = self._snapshot(t_s)
         region = snapshot.seen.copy()
+        region[self._narrow(t_s)[0]] = True
         for sight, flagged, _ in snapshot.reflections:
             region[sight.pixels[flagged]] = True
         for shadow, flagged, _ in snapshot.shadows:
@@ -121,6 +125,7 @@ class Visibility:
         speed = np.zeros(snapshot.seen.shape)
         seen = np.flatnonzero(snapshot.seen)
         speed[seen] = self._image_motion(seen, self._moved(seen, snapshot, t_s, t_s + _STEP_S))
+        np.maximum.at(speed, *self._narrow(t_s))
         for shadow, flagged, hits in snapshot.shadows:
             pixels = shadow.pixels[flagged]
             moved = imaged(self._moved_shadow(shadow, flagged, hits, t_s), [p[flagged] for p in shadow.planes])
@@ -148,10 +153,16 @@ class Visibility:
         for view, camera, mine in self._by_view(seen):
             uv, _ = camera.project(moved[mine])
             flow[seen[mine]] = uv - self._centres(seen[mine], view)
-        numbers = np.where(snapshot.seen, self._numbers(snapshot.hits), 0).astype(np.uint32)
+        numbers = np.where(snapshot.seen, object_numbers(self.world, snapshot.hits), 0).astype(np.uint32)
         return self.depths(t_s), numbers.reshape(self.shape), flow.reshape(*self.shape, 2)
 
     # ------------------------------------------------------------ internals
+
+    def _narrow(self, t_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return pixels [K] with corners of narrow bodies before static surfaces, and their motion in a moment, px."""
+        pixels, distance, motion = narrow_corners(self.world, self.cameras, t_s, t_s + _STEP_S)
+        near = distance < self._static_hits[0][pixels]
+        return pixels[near], motion[near]
 
     def _z(self, distance: np.ndarray) -> np.ndarray:
         """Return z in camera coordinates [C, H, W] float32 of points at a distance [N] along the centre rays."""
@@ -287,14 +298,3 @@ class Visibility:
     def _centres(self, pixels: np.ndarray, view: int) -> np.ndarray:
         row, column = np.divmod(pixels - view * self.shape[1] * self.shape[2], self.shape[2])
         return np.stack([column + 0.5, row + 0.5], axis=1)
-
-    def _numbers(self, hits: Hits) -> np.ndarray:
-        """Return the numbers, from 1, of the objects that were hit; each body of a surface is an object."""
-        first = len(self.world.instances) + 1
-        numbers = hits.number.astype(np.int64) + 1
-        for k, surface in enumerate(self.world.deforming.values(), start=len(self.world.instances)):
-            mine = hits.number == k
-            bodies = np.zeros(len(surface.part.mesh.faces), np.int64) if surface.bodies is None else surface.bodies
-            numbers[mine] = first + bodies[hits.face[mine]]
-            first += int(bodies.max()) + 1
-        return numbers

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +33,18 @@ class Deforming:
     part: Part
     vertices: Callable[[float], np.ndarray]
     bodies: np.ndarray | None = None
+
+    @cached_property
+    def corner_widths(self) -> np.ndarray:
+        """The width of each vertex's body at t = 0, [N], metres: twice its largest distance from the mean corner."""
+        places, owner = self.vertices(0.0), np.zeros(len(self.part.mesh.vertices), np.int64)
+        if self.bodies is not None:
+            owner[self.part.mesh.faces] = self.bodies[:, None]
+        sums = np.stack([np.bincount(owner, axis) for axis in places.T], axis=1)
+        away = np.linalg.norm(places - (sums / np.bincount(owner)[:, None])[owner], axis=1)
+        widths = np.zeros(len(sums))
+        np.maximum.at(widths, owner, 2 * away)
+        return np.asarray(widths[owner])
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """World `rain`: heavy drops fall over a garden deck, and a ball flies behind them.
 
 Hard for what holds on to the nearest surface: for an instant a drop hides what is behind it, anywhere in the image.
-Each is a pixel wide, and falls nearly twice its width in a millisecond.
+They are half a pixel to 1.5 px wide in `small`, and fall nearly twice their width in a millisecond.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -14,13 +15,15 @@ from scipy.ndimage import binary_erosion as erode
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import gray as gray_of
-from spike4dgs.generators.rendering.image_motion import KeyPlan
+from spike4dgs.generators.rendering.image_motion import KeyPlan, narrow_corners
 from spike4dgs.generators.rendering.keyframes import KeyStore
 from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews, make_tracer
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import Deforming, Part, WorldScene
-from spike4dgs.generators.worlds.meshes import merge, quad, rotation
+from spike4dgs.generators.worlds.meshes import ellipsoid, merge, quad, rotation
+from spike4dgs.generators.worlds.parts.rigid_bodies import owners
 from spike4dgs.generators.worlds.surfaces import Material
 
 WIDTH, HEIGHT, SPP, BACKGROUND_SPP = 64, 40, 32, 64
@@ -225,6 +228,35 @@ def test_deforming_surfaces_have_masks_numbers_and_flow():
     normal = np.cross(before[1] - before[0], before[3] - before[0])
     first = points[ids[ids > 0] == 1]
     assert np.abs((first - before[0]) @ (normal / np.linalg.norm(normal))).max() < 1e-3
+
+
+def hail(camera: Camera, width_px: float) -> tuple[WorldScene, Callable[[float], np.ndarray]]:
+    """Return the car's street with 80 balls of a width that fall, as one mesh, and their centres at a time."""
+    rng = np.random.default_rng(0)
+    uv, z = rng.uniform(5, (WIDTH - 5, HEIGHT - 12), (80, 2)), rng.uniform(2.0, 3.0, 80)
+    balls = [ellipsoid([width_px / 2 * d / camera.fx] * 3, segments=8) for d in z]
+    mesh, (owner, bodies) = merge(balls), owners(balls)
+
+    def centres(t_s: float) -> np.ndarray:
+        return camera.unproject(uv, z) - [0, 0, 9.0 * (t_s - T_S)]
+
+    surface = Deforming(Part(mesh, Material((0.9, 0.9, 0.9))), lambda t: mesh.vertices + centres(t)[owner], bodies)
+    return replace(world("car"), groups={}, instances={}, poses=lambda t: {}, deforming={"ball": surface}), centres
+
+
+def test_bodies_between_the_centres_of_pixels_are_traced():
+    """Rays through pixel centres miss most balls half a pixel wide, which are part of the image all the same."""
+    (camera,) = cameras(world("car"), WIDTH, HEIGHT, (4,))
+    falling, centres = hail(camera, 0.5)
+    r = MultiViewRenderer(falling, [camera], seed=0, spp=16, background_spp=16)
+    (uv, _), (later, _) = (camera.project(centres(t)) for t in (T_S, T_S + 1e-5))
+    column, row = uv.astype(int).T
+    assert r.object_masks(T_S)[0][row, column].mean() < 0.5
+    assert r.traced(T_S)[0][row, column].all()
+    own = np.linalg.norm(later - uv, axis=1) / 1e-5
+    assert (r.speeds(T_S)[0][row, column] > 0.99 * own).all() and r.speeds(T_S).max() < 1.01 * own.max()
+    for wide in (hail(camera, 2.0)[0], two_flaps()):  # centres find these: nothing is added
+        assert not len(narrow_corners(wide, [camera], T_S, T_S + 1e-5)[0])
 
 
 @pytest.mark.parametrize(("spp", "background_spp"), [(24, 64), (0, 64), (32, 16), (16, 48)])
