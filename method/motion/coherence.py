@@ -28,6 +28,7 @@ from spike4dgs.method.splat import Views
 from spike4dgs.method.splat.kernels.jit import kernel
 from spike4dgs.method.splat.kernels.threads import ITEM, run_items
 from spike4dgs.method.splat.kernels.vector_ir import fetch_add
+from spike4dgs.method.splat.types import NEAR
 
 CUBIC = 9  # m1, m2 and m3 of a path in space
 NEAREST = 6
@@ -88,7 +89,8 @@ def neighbours(means: Tensor, views: Views) -> Neighbours:
     """Return the `NEAREST` neighbours of Gaussians at `means` [N, 3]; none where there are no more than these."""
     x = means.detach()
     depth = x @ views.w2c[0, 2, :3].to(x) + views.w2c[0, 2, 3].to(x)
-    pixels = torch.where(depth > 0, views.K[0, 0, 0].to(x) / depth, 0.0)  # behind the view: as if it were far away
+    # What is nearer than the near plane, or behind the view, is not rendered: as if it were far away.
+    pixels = torch.where(depth > NEAR, views.K[0, 0, 0].to(x) / depth, 0.0)
     if len(x) <= NEAREST:
         return Neighbours(torch.zeros(len(x), 0, dtype=torch.int64, device=x.device), pixels)
     return Neighbours(nearest(x, NEAREST)[0], pixels)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spike4dgs.benchmark.arrays import Float32
+from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.weights import FoundWeights
@@ -21,6 +22,9 @@ from spike4dgs.method.images.recorded import Recorded
 from spike4dgs.method.models.network_weights import WeightKind
 from spike4dgs.method.motion.base import Extent
 from spike4dgs.method.settings import Settings
+from spike4dgs.method.splat.types import NEAR
+
+FARTHEST = 1e4  # x a scene's size from the origin: float32 resolves a thousandth of it there
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +91,8 @@ def measure(start: Start, scene: TrainingScene) -> Extent:
     """Return the scene's box and size, from the points seen and not only from the array, small beside the scene.
 
     The box holds 98 % of the points on each axis and a margin of a tenth. Size: the larger of 1.1 x the array's radius
-    (3DGS) and half the points' median distance.
+    (3DGS) and half the points' median distance. Raises UserError where nothing would be rendered, as all is too near in
+    the unit of the poses, or where they are so far from the origin that float32 does not resolve the scene.
     """
     centers = np.stack([c.center for c in start.cameras])
     middle = centers.mean(axis=0)
@@ -95,6 +100,15 @@ def measure(start: Start, scene: TrainingScene) -> Extent:
     margin = 0.1 * (high - low) + 1e-3 * float((high - low).max())
     distance = float(np.median(np.linalg.norm(start.points - middle, axis=1)))
     scale = max(1.1 * float(np.linalg.norm(centers - middle, axis=1).max()), 0.5 * distance)
+    depths = [float(np.median(c.project(start.points.astype(np.float64))[1])) for c in start.cameras]
+    if max(depths) <= 2 * NEAR:
+        expected = f"things farther than {2 * NEAR:g} m from the cameras"
+        found = f"a median distance of {max(depths):.3g} m"
+        raise problem(f"scene {scene.id}", expected, found, "give poses in metres: COLMAP's unit is arbitrary")
+    if (away := float(np.abs(centers).max())) > FARTHEST * scale:
+        expected = f"an origin near the scene, whose size is {scale:.3g} m"
+        fix = "subtract the cameras' mean position from all poses"
+        raise problem(f"scene {scene.id}", expected, f"cameras {away:.3g} m from it", fix)
 
     def tensor(a: NDArray[np.float64]) -> Tensor:
         return torch.as_tensor(a, dtype=torch.float32)

@@ -46,9 +46,10 @@ class DepthMap:
 
 
 def widest_baseline(cameras: Sequence[Camera]) -> float:
-    """Return the largest distance between two cameras, m."""
+    """Return the largest distance between two cameras, m; 0 where it is no more than their centres' rounding."""
     centers = np.stack([c.center for c in cameras])
-    return float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
+    widest = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
+    return widest if widest > 1e-9 * float(np.abs(centers).max()) else 0.0
 
 
 def inverse_depth_step(cameras: Sequence[Camera], parallax_px: float = 1.0) -> float:

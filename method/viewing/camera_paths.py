@@ -72,7 +72,7 @@ def orbit(cameras: Sequence[Camera]) -> Path:
     first = look_at("orbit", middle, target, up, focal=1.0, width=1, height=1)
     right, down = first.R[0], first.R[1]
     reach = [float(np.abs((centers - middle) @ axis).max()) for axis in (right, down)]
-    if max(reach) == 0:
+    if max(reach) <= 1e-9 * float(np.abs(centers).max()):  # one centre, but for rounding
         reach = [ALONE * float(np.linalg.norm(target - middle))] * 2
     focal = float(np.mean([(c.fx + c.fy) / 2 for c in cameras]))
     size = cameras[0]

@@ -12,12 +12,13 @@ from toy_fits import MOTIONS, SMALL_PLANES, WORLD, checkpoints, method, request,
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Budget, get_method
+from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.method.gaussians.density import DensitySettings
 from spike4dgs.method.images.training import ImageSettings, choose_ticks
 from spike4dgs.method.schedule import Stage, TrainerSettings, choose_time, stages
 from spike4dgs.method.settings import as_dict, in_budget, make_settings, override
 from spike4dgs.method.splat import render
-from spike4dgs.method.starts.base import measure
+from spike4dgs.method.starts.base import Start, measure
 from spike4dgs.method.supervision.spike import SpikeSettings
 from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
@@ -367,3 +368,24 @@ def test_extent_comes_from_the_points_and_not_only_from_the_array():
     extent = measure(replace(start, points=np.concatenate([start.points, outlier])), scene)
     assert extent.scale > 1.5  # the array's own radius is 0.57 m, the scene is 4 m away
     assert float(extent.high[0]) < 10 and (extent.low < extent.high).all()
+
+
+def rescaled(factor: float, shift: float = 0.0) -> tuple[Start, TrainingScene]:
+    """The world with lengths in another unit, and its origin elsewhere."""
+    start, scene, moved = surfaces(WORLD.training, 0), WORLD.training, np.array([shift, -shift, shift / 2])
+    cameras = tuple(replace(c, t=factor * c.t - c.R @ moved) for c in start.cameras)
+    points = (factor * start.points + moved).astype(np.float32)
+    return replace(start, cameras=cameras, points=points), replace(scene, cameras=cameras)
+
+
+@pytest.mark.parametrize(("factor", "shift"), [(1e-3, 0.0), (1.0, 1e6)])
+def test_a_scene_that_cannot_be_rendered_or_resolved_is_refused(factor: float, shift: float) -> None:
+    """All nearer than the near plane, as of poses in kilometres; or so far from the origin that float32 is coarse."""
+    expected = "median distance of 0.00" if shift == 0 else "subtract the cameras' mean position"
+    with pytest.raises(UserError, match=expected):
+        measure(*rescaled(factor, shift))
+
+
+@pytest.mark.parametrize(("factor", "shift"), [(0.02, 0.0), (1e4, 0.0), (1.0, 1e3)])
+def test_other_units_and_origins_are_taken(factor: float, shift: float) -> None:
+    assert measure(*rescaled(factor, shift)).scale == pytest.approx(factor * measure(*rescaled(1.0)).scale, rel=1e-3)

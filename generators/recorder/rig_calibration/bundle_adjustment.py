@@ -125,7 +125,7 @@ def adjust(
         rig, cost, H, g, damping = moved, new, new_H, new_g, damping / 5
         if converged:
             break
-    variance = cost / max(2 * int(detections.used.sum()) - columns.n, 1)
+    variance = max(cost / max(2 * int(detections.used.sum()) - columns.n, 1), _FINEST_PX**2)
     return Adjusted(rig, math.sqrt(variance), *_deviations(variance * _diagonal_of_inverse(H), columns))
 
 

@@ -17,6 +17,7 @@ from spike4dgs.method.motion.coherence import (
     neighbours,
 )
 from spike4dgs.method.splat import Views
+from spike4dgs.method.splat.types import NEAR
 
 FOCAL, DEPTH = 300.0, 5.0
 VIEWS = Views(torch.eye(4)[None], torch.tensor([[[FOCAL, 0, 40], [0, FOCAL, 30], [0, 0, 1]]]), 80, 60)
@@ -41,6 +42,13 @@ def gaussians(means: Tensor, coefficients: Tensor) -> Gaussians:
     shapes = {"log_scales": (3,), "quats": (4,), "logits": (), "colors": (1,)}
     rest = {name: torch.zeros(n, *shape) for name, shape in shapes.items()}
     return Gaussians.from_tensors({"means": means, **rest, "coefficients": coefficients})
+
+
+def test_what_is_nearer_than_the_near_plane_has_no_say() -> None:
+    """It is not rendered; as near as it is, it would weigh thousands of times as much as others."""
+    depths = torch.tensor([1e-5, 0.5 * NEAR, 2 * NEAR, DEPTH, -1.0])
+    pixels = neighbours(torch.stack([torch.zeros(5), torch.zeros(5), depths], 1), VIEWS).pixels
+    torch.testing.assert_close(pixels, torch.tensor([0.0, 0.0, FOCAL / (2 * NEAR), FOCAL / DEPTH, 0.0]))
 
 
 @pytest.mark.parametrize("spread", [0.0, 1e-4, 0.01, 10.0])

@@ -1,4 +1,4 @@
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import cv2
 import numpy as np
@@ -27,6 +27,16 @@ def static_views(world: ToyWorld) -> tuple[np.ndarray, np.ndarray]:
     """Noise-free images and depths of all cameras at the middle of the clip."""
     seen = [world.trace(c, 0.5) for c in world.cameras]
     return np.stack([s[0] for s in seen]).astype(np.float32), np.stack([s[1] for s in seen])
+
+
+@pytest.mark.parametrize("center", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.1)])
+def test_cameras_at_one_place_have_no_depth(center: tuple[float, float, float]) -> None:
+    """Their centres differ by rounding where they are not the origin: a camera stores its translation."""
+    scene = WORLD.training
+    cameras = tuple(replace(c, t=-c.R @ np.array(center)) for c in scene.cameras)
+    assert len({tuple(c.center) for c in cameras}) > 1 or not any(center)
+    with pytest.raises(UserError, match="training cameras apart from each other"):
+        rig(replace(scene, cameras=cameras))
 
 
 def test_homography_maps_pixels_as_projecting_through_the_plane_does():
@@ -146,9 +156,9 @@ def test_a_recipe_overrides_the_cell_size_and_its_record_shows_it(start):
 @pytest.mark.parametrize(
     ("initialization", "name", "listed"),
     [
-        ("rig", "min_points", "cell_px"),  # COLMAP's
+        ("rig", "pair_error_px", "cell_px"),  # COLMAP's
         ("dust3r", "cell_px", "ransac_px"),
-        ("colmap", "focal_prior", "min_points"),  # the focal length is known
+        ("colmap", "focal_prior", "pair_error_px"),  # the focal length is known
         ("msdi", "flat_field", "trained_px"),  # always corrected
     ],
 )

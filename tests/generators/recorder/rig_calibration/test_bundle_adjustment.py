@@ -196,15 +196,17 @@ def test_an_array_that_no_pinholes_explain_is_refused():
         )
 
 
-def test_a_board_that_is_hardly_tilted_leaves_the_focal_length_open():
-    """Of a board parallel to the image, only the ratio of focal length and distance is known."""
+@pytest.mark.parametrize(("tilt_deg", "noise_px"), [(1.0, 0.05), (0.0, 0.0)])
+def test_a_board_that_is_hardly_tilted_leaves_the_focal_length_open(tilt_deg: float, noise_px: float) -> None:
+    """Of a board parallel to the image, only the ratio of focal length and distance is known, however sharp it is."""
     rng, focal, size, views = np.random.default_rng(0), 600.0, (400, 250), 12
-    turns = Rotation.from_euler("xyz", rng.uniform(-1, 1, (views, 3)) * [1, 1, 20], degrees=True).as_matrix()
+    turns = Rotation.from_euler("xyz", rng.uniform(-1, 1, (views, 3)) * [tilt_deg, tilt_deg, 20], degrees=True)
+    turns = turns.as_matrix()
     places = rng.uniform([-0.05, -0.05, 1.3], [0.05, 0.05, 1.7], (views, 3))
     first = BOARD.corners @ turns.transpose(0, 2, 1) + places[:, None]
-    second = first @ Rotation.from_euler("y", 5, degrees=True).as_matrix() - [0.12, 0, 0]
+    second = first @ Rotation.from_euler("y", 5 * tilt_deg, degrees=True).as_matrix() - [0.12, 0, 0]
     x = np.concatenate([first, second])
-    uv = focal * x[..., :2] / x[..., 2:] + np.array(size) / 2 + 0.05 * rng.normal(size=(*x.shape[:2], 2))
+    uv = focal * x[..., :2] / x[..., 2:] + np.array(size) / 2 + noise_px * rng.normal(size=(*x.shape[:2], 2))
     camera, view = np.repeat([0, 1], views), np.tile(np.arange(views), 2)
     detections = Detections(camera, view, uv, np.ones(uv.shape[:2], bool))
     rig, reference = estimate_rig(detections, BOARD.corners, ["a", "b"], size)
