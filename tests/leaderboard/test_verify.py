@@ -133,7 +133,7 @@ def test_scores_that_need_weights_are_checked_with_these_and_else_stay_as_claime
     entry = read(enter(done, "with"))
     assert (entry["verification"]["label"], entry["verification"]["unverified"]) == ("re-scored", ["metaiqa"])
     assert entry["record"]["mean"]["metaiqa"] > 0 and board(done)["boards"][0]["rows"][0]["unverified"] == ["metaiqa"]
-    assert "with: re-scored (as claimed, not computed again: metaiqa), rank 1" in said()
+    assert "with: re-scored (as claimed, not computed again: metaiqa), place 1" in said()
     monkeypatch.setenv(VARIABLE, str(weights.parent))
     path = enter(done, "with")
     assert read(path)["verification"]["unverified"] == []
