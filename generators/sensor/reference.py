@@ -103,6 +103,5 @@ def simulate_reference(
     keys: Keys, key_ticks: Sequence[int], n_ticks: int, sensor: Sensor, charge: Int32, means: bool = False
 ) -> NDArray[np.bool_]:
     """Return spikes [n_ticks, H, W], upright and unpacked; the arguments are those of `sensor.model.simulate`."""
-    if means:
-        return np.stack([fired for fired, _ in fire((_exact(key) for key in keys), sensor, charge, keys[0])])
-    return np.stack([fired for fired, _ in fire(tick_means(keys, key_ticks, n_ticks), sensor, charge, keys[0])])
+    light = map(_exact, keys) if means else tick_means(keys, key_ticks, n_ticks)
+    return np.stack([fired for fired, _ in fire(light, sensor, charge, keys[0])])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 from spike4dgs.benchmark.files import sha256_json
@@ -37,7 +38,7 @@ def table_block(group: Group, records: Sequence[Record]) -> list[str]:
         lines += [f"**{knowledge.capitalize()}**: {KNOWLEDGE[knowledge]}. Means of {len(group.scenes)} scenes.", ""]
         if ranking.rows:
             lines += [*markdown(_HEADS, _cells(ranking)), ""]
-        lines += _incomplete(rows)
+        lines += incomplete_lines(rows)
     return [*lines, _LEGEND, "", provenance(own, group)]
 
 
@@ -112,6 +113,12 @@ def of_group(group: Group, records: Iterable[Record]) -> list[Record]:
         and r["scene"] in group.scenes
         and (r["budget"], r["split"]) == (budget, group.split)
     ]
+
+
+def measured_part(group: Group, own: Iterable[Record]) -> Group:
+    """Return a group with those of its scenes that its first row, measured first, has records of, failed ones too."""
+    there = {record["scene"] for record in own if record["row"] == group.rows[0].name}
+    return replace(group, scenes=tuple(scene for scene in group.scenes if scene in there))
 
 
 def _blocks(group: Group, own: Sequence[Record]) -> list[tuple[str, list[MeasuredRow], Ranking]]:
@@ -210,13 +217,12 @@ def _lead_text(row: MeasuredRow, rivals: Sequence[MeasuredRow]) -> str:
     return ", and ".join(parts)
 
 
-def _incomplete(rows: Sequence[MeasuredRow]) -> list[str]:
+def incomplete_lines(rows: Iterable[MeasuredRow]) -> list[str]:
     """Return a paragraph about the rows that are not ranked."""
     texts = []
-    for row in rows:
-        if not row.is_complete:
-            failed = (f"; {scene}, seed {seed}: {error}" for (scene, seed), error in row.failed.items())
-            texts.append(f"`{row.name}` ({row.scenes_there} of {len(row.scenes)} scenes{''.join(failed)})")
+    for row in (row for row in rows if not row.is_complete):
+        failed = (f"; {scene}, seed {seed}: {error}" for (scene, seed), error in row.failed.items())
+        texts.append(f"`{row.name}` ({row.scenes_there} of {len(row.scenes)} scenes{''.join(failed)})")
     return [f"Incomplete, not ranked: {', '.join(texts)}.", ""] if texts else []
 
 

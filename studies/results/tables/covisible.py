@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, metric_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NOTHING, measured_part, metric_text, of_group, provenance
 from spike4dgs.studies.results.changes import legend_of, mark
 from spike4dgs.studies.results.comparison import MeasuredRow, rows_of
 from spike4dgs.studies.results.records import Record
@@ -35,9 +35,7 @@ def covisible_block(records: Sequence[Record]) -> list[str]:
 
 def _track_lines(own: Sequence[Record]) -> list[list[str]]:
     """Return a line for each row that is complete over the scenes of the first."""
-    names = [row.name for row in realistic.GROUP.rows]
-    there = {record["scene"] for record in own if record["row"] == names[0]}
-    scenes = tuple(scene for scene in realistic.GROUP.scenes if scene in there)
+    names, scenes = [row.name for row in realistic.GROUP.rows], measured_part(realistic.GROUP, own).scenes
     rows = [row for row in rows_of(names, scenes, own) if row.values(METRICS[1]) is not None]
     return [
         [f"`{row.name}`, {len(scenes)} scenes", *(metric_text(row.mean(m), 2) for m in METRICS), *_deviations(row)]

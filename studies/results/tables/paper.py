@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from spike4dgs.generators.worlds import OURS
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, metric_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NOTHING, incomplete_lines, measured_part, metric_text, of_group, provenance
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
 from spike4dgs.studies.results.plan import Group, track_scenes
 from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.conditions import GROUP as CONDITIONS
 
 GROUP = Group("paper", "The size of the paper's scenes", track_scenes("paper", OURS), CONDITIONS.rows)
-_FIRST = GROUP.rows[0].name  # measured first: its scenes are those of the table
 FIT_S, IMAGES_PER_S = 1200, 40  # that the paper states for its method, on an RTX 4090
 _HEADS = ("row", "PSNR, moving", "PSNR", "SSIM", "FLIP", "fit, s", "of 20 min", "images/s", "of 40", "memory, GB")
 
@@ -22,9 +20,9 @@ _HEADS = ("row", "PSNR, moving", "PSNR", "SSIM", "FLIP", "fit, s", "of 20 min", 
 def paper_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of a table of the rows that have all scenes of the track that were measured, best first."""
     own = of_group(GROUP, records)
-    there = {record["scene"] for record in own if record["row"] == _FIRST and record["error"] is None}
-    scenes = tuple(scene for scene in GROUP.scenes if scene in there)
-    measured = rows_of([row.name for row in GROUP.rows], scenes, own) if scenes else []
+    group = measured_part(GROUP, own)
+    scenes = group.scenes
+    measured = [row for row in rows_of([row.name for row in GROUP.rows], scenes, own) if row.cells or row.failed]
     complete = sorted((row for row in measured if row.is_complete), key=lambda row: -(row.mean(RANKED_BY) or 0.0))
     if not complete:
         return [NOTHING]
@@ -33,8 +31,9 @@ def paper_block(records: Sequence[Record]) -> list[str]:
         f"{what}. Two columns relate costs to what the paper states for its method on an RTX 4090: 20 minutes a fit "
         f"and {IMAGES_PER_S} images/s. Times in parentheses were measured while other programs ran."
     )
-    shown = [record for record in own if record["scene"] in there]
-    return [*markdown(_HEADS, map(_line, complete)), "", legend, "", provenance(shown, replace(GROUP, scenes=scenes))]
+    shown = [record for record in own if record["scene"] in scenes]
+    table = [*markdown(_HEADS, map(_line, complete)), "", *incomplete_lines(measured)]
+    return [*table, legend, "", provenance(shown, group)]
 
 
 def _line(row: MeasuredRow) -> list[str]:

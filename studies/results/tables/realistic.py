@@ -8,7 +8,7 @@ from dataclasses import replace
 from spike4dgs.benchmark.variants import PUBLIC_VARIANT
 from spike4dgs.generators.worlds import OURS
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, both_text, of_group, provenance, table_block
+from spike4dgs.studies.results.blocks import NOTHING, both_text, measured_part, of_group, provenance, table_block
 from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import rows_of
 from spike4dgs.studies.results.plan import Group, track_scenes
@@ -16,25 +16,19 @@ from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.conditions import GROUP as CONDITIONS
 
 GROUP = Group("small", "A realistic camera", track_scenes("small", OURS), CONDITIONS.rows)
-_FIRST = GROUP.rows[0].name  # measured first: its scenes are those of the tables
-
-
-def _measured(records: Sequence[Record]) -> tuple[list[Record], set[str]]:
-    """Return the records of the track, and the scenes that were measured."""
-    own = of_group(GROUP, records)
-    return own, {record["scene"] for record in own if record["row"] == _FIRST}
 
 
 def realistic_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of the rows' table, over the scenes of the track that were measured."""
-    own, there = _measured(records)
-    group = replace(GROUP, scenes=tuple(scene for scene in GROUP.scenes if scene in there))
-    return table_block(group, own) if there else [NOTHING]
+    own = of_group(GROUP, records)
+    group = measured_part(GROUP, own)
+    return table_block(group, own) if group.scenes else [NOTHING]
 
 
 def cameras_block(records: Sequence[Record]) -> list[str]:
     """Return the lines of a table of complete rows: the same worlds by the ideal camera and by the realistic one."""
-    names, (own, there) = [row.name for row in GROUP.rows], _measured(records)
+    names, own = [row.name for row in GROUP.rows], of_group(GROUP, records)
+    there = measured_part(GROUP, own).scenes
     pairs = {
         realistic: ideal
         for world in OURS

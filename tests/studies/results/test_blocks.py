@@ -598,17 +598,22 @@ def test_cameras_are_compared_on_the_same_worlds():
 
 
 def test_the_papers_size_beside_the_papers_times():
-    """Over the scenes that ours has; rows that lack one of these are left out."""
+    """Over the scenes that ours was tried on; rows that lack one of these, or failed on it, are named below."""
     scenes = track_scenes("paper", ["car", "van", "bird"])
     found = [record("tfp+4dgs", scene, 31.0, fit_seconds=1500.0, render_fps=10.0, quiet=False) for scene in scenes]
     found += [record(OURS, scene, 40.0 + k, fit_seconds=120.0, render_fps=200.0) for k, scene in enumerate(scenes[:2])]
-    found += [record("spike4dgs", scenes[0], 39.0), record(OURS, scenes[2], 0.0, error="no weights", metrics={})]
-    lines = paper_block([r | {"peak_memory_mb": 2040.0} for r in found])
+    found.append(record("spike4dgs", scenes[0], 39.0))
+    found = [r | {"peak_memory_mb": 2040.0} for r in found]
+    lines = paper_block(found)
     assert lines[2:4] == [
         f"| `{OURS}` | 40.50 | 42.50 | 0.9700 | 0.050 | 120 | 0.10 | 200 | 5.00 | 2.0 |",
         "| `tfp+4dgs` | 31.00 | 33.00 | 0.9700 | 0.050 | (1500) | (1.25) | (10) | (0.25) | 2.0 |",
     ]
-    assert lines[4] == "" and lines[5].startswith("Means of 2 scenes: car-0-paper, van-0-paper.")
+    assert lines[4:7] == ["", "Incomplete, not ranked: `spike4dgs` (1 of 2 scenes).", ""]
+    assert lines[7].startswith("Means of 2 scenes: car-0-paper, van-0-paper.")
+    failed = paper_block([*found, record(OURS, scenes[2], 0.0, error="no weights", metrics={})])
+    assert failed[2].startswith("| `tfp+4dgs` |") and failed[3] == "", "ours has no mean"
+    assert f"`{OURS}` (2 of 3 scenes; bird-0-paper, seed 0: no weights)" in failed[4]
 
 
 def test_a_part_is_worth_what_its_absence_costs():
