@@ -26,7 +26,7 @@ from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.untrusted import Expected, read_npz
 from spike4dgs.generators.profiles import RATE_HZ, Job
-from spike4dgs.generators.render_tasks import cameras_of, recorded_job, world_of
+from spike4dgs.generators.render_tasks import cameras_of, recorded_job, renderer_of, world_of
 from spike4dgs.generators.rendering.keyframes import read_arrays, write_arrays
 from spike4dgs.generators.rendering.render import MultiViewRenderer, StaticViews
 from spike4dgs.generators.streams import sensor_of
@@ -112,7 +112,7 @@ class WorldTruth:
         kept = truth.folder / "background.npz"
         if not kept.is_file():
             write_arrays(kept, self.renderer(self.cameras, samples).static.arrays())
-        static = StaticViews.from_arrays(read_arrays(kept, "background", "first"))
+        static = StaticViews.from_arrays(read_arrays(kept))
         renderer = self.renderer(self.cameras, samples, static)
         if not truth.surfaces_file.is_file():
             write_arrays(truth.surfaces_file, surfaces(renderer, self.job.n_ticks, ticks))
@@ -121,17 +121,12 @@ class WorldTruth:
             write_arrays(truth.image_file(tick), {"images": renderer.keys(tick / RATE_HZ)})
 
     def renderer(self, cameras: Sequence[Camera], samples: int, static: StaticViews | None = None) -> MultiViewRenderer:
-        """Return a renderer of the scene's world as `cameras` see it, with random numbers of its own."""
+        """Return a renderer of the scene's truth as `cameras` see it, with random numbers of its own."""
         background = max(self.job.profile.background_spp, samples)
-        return MultiViewRenderer(
-            world_of(self.job),
-            cameras,
-            seed=self.job.seed + _SEED,
-            spp=samples,
-            background_spp=background,
-            static=static,
-            psf_px=self.job.physics.psf_px,
-        )
+        own = {"seed": self.job.seed + _SEED, "spp": samples, "background_spp": background, "color": False}
+        renderer = renderer_of(self.job, cameras, truth=True, static=static, **own)
+        assert isinstance(renderer, MultiViewRenderer)  # `find_truth` refuses arrays that move
+        return renderer
 
     def maps(self) -> Arrays:
         """Return gain and dark rate [C, H, W] of the cameras' sensors."""

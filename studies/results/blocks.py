@@ -10,7 +10,7 @@ from itertools import combinations
 from spike4dgs.benchmark.files import sha256_json
 from spike4dgs.benchmark.method import make_budget
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.changes import kind_of
+from spike4dgs.studies.results.changes import incomplete_lines, kind_of, unmeasured_lines
 from spike4dgs.studies.results.comparison import BOTH, RANKED_BY, MeasuredRow, Ranking, lead, rank, rows_of
 from spike4dgs.studies.results.plan import ALL_ROWS, KNOWLEDGE, TABLE1, TABLE2, Group, cells_of
 from spike4dgs.studies.results.records import DIGITS, NOT_FINITE, Record
@@ -39,6 +39,7 @@ def table_block(group: Group, records: Sequence[Record]) -> list[str]:
         if ranking.rows:
             lines += [*markdown(_HEADS, _cells(ranking)), ""]
         lines += incomplete_lines(rows)
+    lines += unmeasured_lines(group, own)
     return [*lines, _LEGEND, "", provenance(own, group)]
 
 
@@ -215,15 +216,6 @@ def _lead_text(row: MeasuredRow, rivals: Sequence[MeasuredRow]) -> str:
                 side = "ahead of" if found.difference > 0 else "behind"
                 parts.append(f"{size} dB {side} `{found.rival}` {where}")
     return ", and ".join(parts)
-
-
-def incomplete_lines(rows: Iterable[MeasuredRow]) -> list[str]:
-    """Return a paragraph about the rows that are not ranked."""
-    texts = []
-    for row in (row for row in rows if not row.is_complete):
-        failed = (f"; {scene}, seed {seed}: {error}" for (scene, seed), error in row.failed.items())
-        texts.append(f"`{row.name}` ({row.scenes_there} of {len(row.scenes)} scenes{''.join(failed)})")
-    return [f"Incomplete, not ranked: {', '.join(texts)}.", ""] if texts else []
 
 
 def provenance(own: Sequence[Record], *groups: Group) -> str:

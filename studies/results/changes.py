@@ -1,4 +1,4 @@
-"""Changes between two measurements, as text: marked where the code of the method differs."""
+"""What a table lacks, and changes between two measurements, as text: marked where the code of the method differs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.recipes import METHODS as OURS
 from spike4dgs.method.tuned import is_tuned
 from spike4dgs.studies.results.comparison import MeasuredRow, changes
+from spike4dgs.studies.results.plan import Group
+from spike4dgs.studies.results.records import Record
 
 OTHER_CODE = "†"
 _LEARNED = {
@@ -55,3 +57,19 @@ def legend_of(text: str, lines: Iterable[Sequence[str]]) -> str:
         "That may explain a part of the change."
     )
     return text + note * marked
+
+
+def incomplete_lines(rows: Iterable[MeasuredRow]) -> list[str]:
+    """Return a paragraph about the rows that are not ranked."""
+    texts = []
+    for row in (row for row in rows if not row.is_complete):
+        failed = (f"; {scene}, seed {seed}: {error}" for (scene, seed), error in row.failed.items())
+        texts.append(f"`{row.name}` ({row.scenes_there} of {len(row.scenes)} scenes{''.join(failed)})")
+    return [f"Incomplete, not ranked: {', '.join(texts)}.", ""] if texts else []
+
+
+def unmeasured_lines(group: Group, own: Iterable[Record]) -> list[str]:
+    """Return a paragraph about the planned rows of which there is no record."""
+    there = {r["row"] for r in own}
+    lacking = [f"`{row.name}`" for row in group.rows if row.name not in there]
+    return [f"Planned and not measured yet: {', '.join(lacking)}.", ""] if lacking else []

@@ -202,14 +202,15 @@ def _recipe(name: str) -> RecipeMethod:
 
 def write_results(out: Path) -> None:
     """Write OUT/tuning.md, what each search in OUT found, and its trials as OUT/ROW@STEPS.csv."""
-    columns = ("row", "steps", "as it is: whole / moving, dB", "best: whole / moving, dB", "trials", "hours", "changed")
+    whole = "whole / moving, dB"
+    columns = ("row", "steps", f"as it is: {whole}", f"best: {whole}", "best trial", "hours", "changed")
     rows = []
     for record in _records(out):
         done = record["trials"]
         first, best = done[0], best_of(done, len(record["scenes"]))
         changed = ", ".join(f"{k} {_short(v)}" for k, v in best["knobs"].items() if v != first["knobs"][k])
         steps = _short(record["budget"])
-        cells = (steps, _pair(first), _pair(best), str(len(done)), _hours(done), changed or "-")
+        cells = (steps, _pair(first), _pair(best), f"{best['number'] + 1} of {len(done)}", _hours(done), changed or "-")
         rows.append((f"`{record['row']}`", *cells))
         heads = ["trial", *first["knobs"], *(f"{s} {m}" for s in record["scenes"] for m in METRICS), "seconds"]
         write_csv(out / f"{record['row']}@{steps}.csv", heads, [_line(trial, record["scenes"]) for trial in done])

@@ -16,9 +16,10 @@ from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.untrusted import read_npz
 from spike4dgs.generators.physics import Physics
-from spike4dgs.generators.profiles import PROFILES, Job
-from spike4dgs.generators.render_tasks import recorded_job
-from spike4dgs.studies.oracle_truth import Truth, find_truth
+from spike4dgs.generators.profiles import PROFILES, SPLIT_PROFILES, Job
+from spike4dgs.generators.render_tasks import cameras_of, recorded_job, renderer_of
+from spike4dgs.generators.rendering.split_render import SplitRenderer
+from spike4dgs.studies.oracle_truth import Truth, WorldTruth, find_truth
 
 TICKS, SAMPLES = (10, 70), 16
 MIDDLE = 40  # of 80 ticks: a target of the held-out camera
@@ -63,6 +64,16 @@ def test_images_at_the_held_out_camera_are_its_truth_but_for_noise(scene: Scene)
     moving = scene.moving(Target("cam_04", MIDDLE))
     there = {tick: rms(image[moving], target[moving]) for tick, target in targets.items()}
     assert min(there[20], there[60]) > 2 * there[MIDDLE], "it is that tick's alone"
+
+
+def test_split_light_is_rendered_as_the_scene_was() -> None:
+    """Its truth has maps of soft light, and so has that of oracles: whole paths would differ by what maps smooth."""
+    job = Job("car", 0, 0, "tiny", SPLIT_PROFILES["tiny"], 0.004)
+    scene_truth = renderer_of(job, cameras_of(job)[:1], truth=True)
+    oracle = WorldTruth(job, cameras_of(job)).renderer(cameras_of(job)[:1], 16)
+    assert isinstance(scene_truth, SplitRenderer) and isinstance(oracle, SplitRenderer)
+    assert oracle.soft == scene_truth.soft and oracle._anchor_s == scene_truth._anchor_s
+    assert oracle._seed != scene_truth._seed and not oracle.color
 
 
 def test_images_are_those_of_the_training_cameras_in_their_order(scene: Scene, truth: Truth) -> None:

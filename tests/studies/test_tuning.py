@@ -208,6 +208,7 @@ def test_the_best_settings_become_a_row(whole, page, tmp_path):
     assert row.name == "tfp+stg.tuned"
     assert row.settings["trainer.lr_means"] == pytest.approx(1.6e-4 * best["knobs"]["rates"])
     text = page.read_text()
+    assert f"| {best['number'] + 1} of {TRIALS} |" in text, "a best trial among the last says that the search went on"
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     assert text.index("| `tfp+stg` | 0.25 |") < text.index(KEPT) and text.count("\n| ") == 4
     assert (page.parent / "tables" / "tuning" / "tfp+stg@0.25.csv").read_text().count("\n") == TRIALS + 1

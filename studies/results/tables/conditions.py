@@ -20,7 +20,7 @@ from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NOTHING, both_text, of_group, provenance, psnr_texts
 from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import BOTH, MeasuredRow, rows_of
-from spike4dgs.studies.results.plan import CEILING, NOT_TUNED, OUR_TRIALS, Group, Row
+from spike4dgs.studies.results.plan import CEILING, NOT_TUNED, OUR_TRIALS, X_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
 from spike4dgs.studies.results.tables.ceilings import ceiling_row
 
@@ -90,7 +90,7 @@ GROUP = Group(
     "Conditions of camera and light",
     tuple(dict.fromkeys(scene for condition in CONDITIONS for scene in condition.scenes)),
     (
-        Row("spike4dgs-x", 3, OUR_TRIALS, ours=True),
+        Row("spike4dgs-x", 3, X_TRIALS, ours=True),
         Row("tfp+rig-flat+stg"),
         Row("spike4dgs", 1, OUR_TRIALS, ours=True),
         Row("spk2img+stg"),

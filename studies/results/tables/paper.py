@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from spike4dgs.generators.worlds import OURS
 from spike4dgs.studies.kit.timing import markdown
-from spike4dgs.studies.results.blocks import NOTHING, incomplete_lines, measured_part, metric_text, of_group, provenance
+from spike4dgs.studies.results.blocks import NOTHING, measured_part, metric_text, of_group, provenance
+from spike4dgs.studies.results.changes import incomplete_lines
 from spike4dgs.studies.results.comparison import RANKED_BY, MeasuredRow, rows_of
 from spike4dgs.studies.results.plan import Group, track_scenes
 from spike4dgs.studies.results.records import Record

@@ -9,7 +9,7 @@ from spike4dgs.studies.kit.timing import markdown
 from spike4dgs.studies.results.blocks import NINE, NOTHING, both_text, metric_text, of_group, provenance
 from spike4dgs.studies.results.changes import change_text, legend_of
 from spike4dgs.studies.results.comparison import rows_of
-from spike4dgs.studies.results.plan import OUR_TRIALS, Group, Row
+from spike4dgs.studies.results.plan import X_TRIALS, Group, Row
 from spike4dgs.studies.results.records import Record
 
 DEVELOPMENT = ("van-10-small", "motor-10-small", "turntable-10-small")
@@ -35,7 +35,7 @@ GROUP = Group(
     "parts",
     "Parts of spike4dgs-x",
     DEVELOPMENT,
-    tuple(Row(name, 1, OUR_TRIALS, ours=True) for name in (WHOLE, *(f"{WHOLE}[{s}]" for s in SWITCHES.values()))),
+    tuple(Row(name, 1, X_TRIALS, ours=True) for name in (WHOLE, *(f"{WHOLE}[{s}]" for s in SWITCHES.values()))),
 )
 _OWN = replace(NINE, rows=tuple(row for row in NINE.rows if row.name == WHOLE))
 _METRICS = {  # heads of columns -> metric, digits
