@@ -59,7 +59,7 @@ SHOWN = {  # a block -> two rows that it has, if not those of the tables
 }
 SCENES = ("bricks-0-small", "chips-0-small", "turntable-0-small", "bird-0-small")
 OURS = "spike4dgs-x"
-GROUP = Group("made", "Made", SCENES, (Row(OURS, 2, "here", True), Row("a"), Row("b"), Row("c"), Row("tfp+stg"), Row("d")))
+GROUP = Group("made", "Made", SCENES, (Row(OURS, 2, "here", True), *map(Row, ("a", "b", "c", "tfp+stg", "d"))))
 
 
 def record(row: str, scene: str, moving: float, seed: int = 0, **changes: Any) -> dict[str, Any]:
