@@ -19,6 +19,7 @@ from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.images.recorded import Recorded
+from spike4dgs.method.starts.plane_sweep import UNSEEN
 from spike4dgs.method.training_views.changes import COUNTS, RECORDED, ChangeSettings, changing, without_specks
 from spike4dgs.method.training_views.pinholes import nearest_pixels, seen_pixels, undistorted
 
@@ -111,9 +112,9 @@ def white_rates(scene: TrainingScene) -> Float64:
 
 
 def _marked(scene: TrainingScene, images: Float32) -> Float32:
-    """Return images [C, H, W] with -1 where a view sees nothing: the plane sweep takes that as outside of the image."""
+    """Return images [C, H, W] with `UNSEEN` where a view sees nothing: the plane sweep compares no such pixel."""
     if seen := seen_pixels(scene):
-        images[~np.stack(seen)] = -1
+        images[~np.stack(seen)] = UNSEEN
     return images
 
 

@@ -3,6 +3,9 @@
 For a reference view, planes parallel to its image are swept over inverse depth; the other views' images are warped
 onto each plane and compared by zero-mean normalised cross-correlation. No depth range is given: it is found by a
 coarse sweep from infinity to the parallax at which the views would hardly overlap any more.
+
+An image of -1 has no light there: its camera does not see the pixel. Windows of correlation then hold the nearest
+light instead. With marks in them the edges of two fields of view would match, and all views agree on where they do.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from spike4dgs.benchmark.arrays import Float32, Float64, Int64, Mask
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -35,6 +39,7 @@ class SweepSettings(Settings):
 
 
 DEFAULTS = SweepSettings()
+UNSEEN = -1.0  # in place of light, where a camera does not see the pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +76,33 @@ def find_range(cameras: Sequence[Camera], images: Float32, settings: SweepSettin
     """
     planes, step = full_range(cameras, settings), inverse_depth_step(cameras, settings.parallax_step_px)
     half = [c.scaled(c.width // 2, c.height // 2) for c in cameras]
-    small = np.stack([cv2.resize(p, (half[0].width, half[0].height), interpolation=cv2.INTER_AREA) for p in images])
+    light, seen = _unmarked(images)
+    small = _halved(light, half[0])
+    if seen is not None:
+        small[_halved(seen, half[0]) <= 0.5] = UNSEEN
     maps = sweep_all(half, small, planes[::2], settings=settings)
     found = np.concatenate([m.inverse[agreed(half, maps, i, settings)] for i, m in enumerate(maps)])
     if not len(found):
         return planes
     low, high = np.quantile(found, [0.002, 0.998])
     return planes[(planes >= low - 6 * step) & (planes <= high + 6 * step)]
+
+
+def _halved(images: Float32, camera: Camera) -> Float32:
+    size = camera.width, camera.height
+    return np.stack([np.asarray(cv2.resize(p, size, interpolation=cv2.INTER_AREA), np.float32) for p in images])
+
+
+def _unmarked(images: Float32) -> tuple[Float32, Float32 | None]:
+    """Return images whose marked pixels have the nearest light, and where there is some [C, H, W]; None: everywhere."""
+    seen = images != UNSEEN
+    if seen.all():
+        return images, None
+    light = images.copy()
+    for image, where in zip(light, seen, strict=True):
+        if where.any():
+            image[:] = image[tuple(distance_transform_edt(~where, return_distances=False, return_indices=True))]
+    return light, seen.astype(np.float32)
 
 
 def plane_homographies(reference: Camera, other: Camera, inverse_depths: Sequence[float]) -> Iterator[Float64]:
@@ -120,6 +145,7 @@ def sweep(
 
     With a mask `pixels` [H, W] only the rectangle that holds it is swept; elsewhere the score is -1.
     """
+    images, seen_pixels = _unmarked(images)
     window = settings.window_px
     top, left, bottom, right = _rectangle(pixels, window) if pixels is not None else (0, 0, *images.shape[1:])
     reference = np.ascontiguousarray(images[index, top:bottom, left:right])
@@ -135,11 +161,13 @@ def sweep(
     for plane, homographies in enumerate(zip(*maps, strict=True)):
         total, seen = scores[plane], np.zeros((height, width), np.float32)
         for other, homography in zip(others, homographies, strict=True):
-            H = there @ homography @ here
-            warped = cv2.warpPerspective(
-                images[other], H, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0
-            )
-            inside = warped >= 0
+            H, size = there @ homography @ here, (width, height)
+            if seen_pixels is None:
+                warped = cv2.warpPerspective(images[other], H, size, flags=flags, borderValue=-1.0)
+                inside = warped >= 0
+            else:
+                warped = cv2.warpPerspective(images[other], H, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+                inside = cv2.warpPerspective(seen_pixels[other], H, size, flags=flags, borderValue=0.0) > 0.5
             total += np.maximum(_correlation(reference, mean, variance, warped, settings), 0) * inside
             seen += inside
         total /= np.maximum(seen, min(2, len(others)))  # of several, a plane that a single view sees proves nothing

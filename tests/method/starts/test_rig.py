@@ -10,13 +10,21 @@ from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.method import Recipe
 from spike4dgs.benchmark.scene.camera_state import CameraState
-from spike4dgs.benchmark.scene.cameras import look_at
+from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.scene import TrainingScene
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.starts.base import StartRequest
 from spike4dgs.method.starts.clip import window_means
-from spike4dgs.method.starts.plane_sweep import agreed, find_range, full_range, lift, plane_homographies, sweep
+from spike4dgs.method.starts.plane_sweep import (
+    UNSEEN,
+    agreed,
+    find_range,
+    full_range,
+    lift,
+    plane_homographies,
+    sweep,
+)
 from spike4dgs.method.starts.rig import RigSettings, middle_camera, rig
 from spike4dgs.method.starts.structure_from_motion import clip_means
 
@@ -60,6 +68,30 @@ def test_sweep_finds_the_depth_of_textured_surfaces():
     found = sweep(WORLD.cameras, images, 4, full_range(WORLD.cameras))
     error = np.abs(found.inverse * depths[4] - 1)[5:-5, 5:-5]
     assert np.median(error) < 0.02 and np.mean(error < 0.1) > 0.85
+
+
+def field_of(reference: Camera, camera: Camera, inverse: float) -> np.ndarray:
+    """Return the pixels [H, W] that see through a frame at an inverse depth, 10 px inside the reference's image."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    points = camera.unproject(np.stack([u.ravel(), v.ravel()], axis=-1), np.full(u.size, 1 / inverse))
+    uv, _ = reference.project(points)
+    inside = (uv >= 10) & (uv < [camera.width - 10, camera.height - 10])
+    return inside.all(axis=1).reshape(u.shape)
+
+
+@pytest.mark.parametrize("inverse", [0.3, 0.45])
+def test_edges_of_the_fields_of_view_are_no_texture(inverse: float) -> None:
+    """They coincide at one depth, as those of lenses do, and all views agree on it: where nothing is."""
+    images, depths = static_views(WORLD)
+    fields = np.stack([field_of(WORLD.cameras[4], c, inverse) for c in WORLD.cameras])
+    marked = np.where(fields, images, np.float32(UNSEEN))
+    planes = find_range(WORLD.cameras, marked)
+    maps = [sweep(WORLD.cameras, marked, i, planes) for i in range(9)]
+    edge = fields[4].copy()
+    edge[14:-14, 14:-14] = False
+    kept = agreed(WORLD.cameras, maps, 4) & edge
+    wrong = np.abs(maps[4].inverse * depths[4] - 1) > 0.1
+    assert kept[edge].mean() > 0.8 and wrong[kept].mean() < 0.05, "half of them were at the depth of the frame"
 
 
 def test_sweep_of_a_part_equals_the_whole_sweep_inside_it():
