@@ -6,7 +6,6 @@ arrived; the remaining data are read and dropped), CLOSED.
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,13 +14,13 @@ import numpy as np
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip, CameraStats, Clip, Sink
-from spike4dgs.generators.recorder.frames.cutting import Cutter, First, agree, aligned, first_frame, joined
+from spike4dgs.generators.recorder.frames.cutting import SKEW_S, Cutter, First, agree, aligned, first_frame, joined
 from spike4dgs.generators.recorder.frames.delivery import Delivery
 from spike4dgs.generators.recorder.frames.gaps import INTERRUPTED
 from spike4dgs.generators.recorder.frames.layouts import COUNTER, Layout, make_layout
 from spike4dgs.generators.recorder.frames.ring import Ring
 from spike4dgs.generators.recorder.frames.ticks import Run
-from spike4dgs.generators.recorder.resources import buffer_seconds
+from spike4dgs.generators.recorder.resources import ring_slots
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, CameraProfile, RigProfile
 from spike4dgs.generators.recorder.sync import Rate, Rates
 from spike4dgs.generators.recorder.usb.link import Link
@@ -31,9 +30,6 @@ from spike4dgs.generators.recorder.usb.reads import OK, TIME_OUT
 OPEN, ARMED, TRIGGERED, DRAIN, CLOSED = ("OPEN", "ARMED", "TRIGGERED", "DRAIN", "CLOSED")
 
 _POLL_S = 0.005  # interval at which this thread checks the others
-# Counters set by one trigger differ by what a camera sends before the last one is started; others differ by anything.
-_SKEW_S = 0.1
-_SPARE_SLOTS = 8  # of short reads, which fill none: with more of them their blocks are copied
 
 
 def capture(
@@ -98,7 +94,7 @@ class _Capture:
         self.links = {c.id: links[c.id] for c in sorted(profile.cameras, key=_primary) if c.id in links}
         self.restart = all(link.restartable for link in links.values())
         self.from_start = self.restart and not self.layout.count_tags  # the first byte of each camera begins tick 0
-        slots = _slots(profile, self.layout, n_ticks, continuous=sink is not None)
+        slots = ring_slots(profile, self.layout, n_ticks, continuous=sink is not None)
         self.rings = {camera: Ring(slots, profile.transfer_bytes, compact=sink is None) for camera in self.links}
         self.readers: dict[str, Reader] = {}
         self.cutters: dict[str, Cutter] = {}
@@ -120,7 +116,9 @@ class _Capture:
             raise _nothing()
         if self.restart:
             self._halt()
-            self.drain()
+            if sending := self.drain():
+                fix = "correct stop in the rig profile, or remove it: then all cameras keep running"
+                raise problem(f"camera {sending[0]}", "silence after its stop sequence", "it goes on sending", fix)
             for ring in self.rings.values():
                 ring.reset()
 
@@ -147,12 +145,10 @@ class _Capture:
         if self.delivery is not None:
             self.delivery.finish()
 
-    def drain(self) -> None:
-        """Stop the cameras, the primary first, and drop what they still send."""
+    def drain(self) -> list[str]:
+        """Stop the cameras, the primary first, drop what they still send, and return those that never end."""
         self._stop()
-        if self.restart:
-            for link in self.links.values():
-                link.drain()
+        return [camera for camera, link in self.links.items() if not link.drain()] if self.restart else []
 
     def clip(self) -> Clip:
         """Return frames, gaps and statistics of every camera."""
@@ -224,7 +220,7 @@ class _Capture:
         found = {c: f for c, f in firsts.items() if f is not None}
         origin = None
         if self.layout.count_tags and found:
-            origin = agree([f.counter for f in found.values()], round(_SKEW_S * self.profile.fps))
+            origin = agree([f.counter for f in found.values()], round(SKEW_S * self.profile.fps))
             self.sync = ARRIVAL_TIMES if origin is None else FRAME_TAGS
         for camera, reader in self.readers.items():
             first = found.get(camera) or self._unknown_first(reader, origin or 0)
@@ -243,7 +239,7 @@ class _Capture:
 
     def _overdue(self) -> bool:
         """Return whether one camera is so far ahead that the agreement leaves out another without a frame."""
-        most = max(_SKEW_S * self.profile.fps * self.layout.frame_bytes, 4 * self.profile.transfer_bytes)
+        most = max(SKEW_S * self.profile.fps * self.layout.frame_bytes, 4 * self.profile.transfer_bytes)
         readers = [r for r in self.readers.values() if r.origin is not None]
         return any(r.ring.position - (r.origin or 0) > most for r in readers)
 
@@ -289,12 +285,3 @@ def _compile(layout: Layout) -> None:
 
 def _primary(camera: CameraProfile) -> bool:
     return camera.role == PRIMARY
-
-
-def _slots(profile: RigProfile, layout: Layout, n_ticks: int, continuous: bool) -> int:
-    """Return the number of ring slots: for the whole clip, or for `ring_seconds` and twice the reads in flight."""
-    ticks = buffer_seconds(profile, n_ticks / profile.fps) * profile.fps if continuous else float(n_ticks)
-    if not continuous:  # frames before the tick that all cameras have, or the part of one before the clip
-        ticks += _SKEW_S * profile.fps if layout.count_tags else 1
-    slots = math.ceil(ticks * layout.frame_bytes / profile.transfer_bytes)
-    return max(slots, 2 * profile.transfers) if continuous else slots + profile.transfers + _SPARE_SLOTS

@@ -6,6 +6,7 @@ loses data unseen. A better nice value does not suffice.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -13,10 +14,12 @@ from pathlib import Path
 
 import psutil
 
-from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.frames.cutting import SKEW_S
+from spike4dgs.generators.recorder.frames.layouts import Layout, make_layout
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 
 _SHARE = 0.5  # of the free memory; the rest is left to the page cache and other programs
+_SPARE_SLOTS = 8  # of short reads, which fill none: with more of them their blocks are copied
 _MOST_S = 10.0  # twice the longest stall that the recorder is tested with
 
 
@@ -46,6 +49,15 @@ def buffer_seconds(profile: RigProfile, seconds: float, free: int | None = None)
         return max(profile.ring_seconds, least)
     held = _SHARE * (free_bytes() if free is None else free) / (len(profile.cameras) * bytes_per_s(profile))
     return max(min(held, _MOST_S, seconds + least), least)
+
+
+def ring_slots(profile: RigProfile, layout: Layout, n_ticks: int, continuous: bool) -> int:
+    """Return the number of ring slots: for the whole clip, or for `ring_seconds` and twice the reads in flight."""
+    ticks = buffer_seconds(profile, n_ticks / profile.fps) * profile.fps if continuous else float(n_ticks)
+    if not continuous:  # frames before the tick that all cameras have, or the part of one before the clip
+        ticks += SKEW_S * profile.fps if layout.count_tags else 1
+    slots = math.ceil(ticks * layout.frame_bytes / profile.transfer_bytes)
+    return max(slots, 2 * profile.transfers) if continuous else slots + profile.transfers + _SPARE_SLOTS
 
 
 _THREADS = Path("/proc/self/task")

@@ -49,6 +49,7 @@ class FakeCamera:
     limit: int | None = None  # stream byte that it does not pass for now
     depth: int = 3
     restartable: bool = True
+    stops: bool = True  # at its stop sequence
     log: list[str] = field(default_factory=list)
     starts: int = 0
     begun: float | None = None
@@ -62,8 +63,8 @@ class FakeCamera:
         self.log.append(f"stop {self.camera.id}")
         self.begun = None
 
-    def drain(self) -> int:
-        return 0
+    def drain(self) -> bool:
+        return self.stops
 
     def transfers(self) -> FakeTransfers:
         return FakeTransfers(self, self.depth)

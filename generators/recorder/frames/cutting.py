@@ -15,6 +15,9 @@ from spike4dgs.generators.recorder.frames.layouts import COUNTER, Layout
 from spike4dgs.generators.recorder.frames.ring import Block, Ring
 from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 
+# Counters set by one trigger differ by what a camera sends before the last one is started; others differ by anything.
+SKEW_S = 0.1
+
 
 class Cutter:
     """Cuts one camera's blocks into frames, and records which tick was complete when each read ended.

@@ -6,6 +6,7 @@ A camera sends without pause, so its small memory overflows at any moment withou
 from __future__ import annotations
 
 import contextlib
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,8 @@ from spike4dgs.generators.recorder.usb.ports import Port
 from spike4dgs.generators.recorder.usb.reads import Transfers
 
 _DRAIN_S = 0.02  # a device that is silent for so long has sent the rest of its data
-_DRAIN_BYTES = 64 << 20  # more than a bridge or a camera holds: a device that sends so much was not stopped
+# A device that sends more, or for longer, than a bridge or a camera holds data was not stopped.
+_DRAIN_BYTES, _MOST_DRAIN_S = 64 << 20, 0.5
 
 _FIX_START = "check endpoint_out and start in the rig profile, then plug the camera in again"
 
@@ -48,18 +50,19 @@ class Link:
         with contextlib.suppress(usb1.USBError):
             self._write(self.camera.stop)
 
-    def drain(self) -> int:
-        """Read and drop data until the camera is silent, but at most 64 MiB. Return the number of bytes."""
+    def drain(self) -> bool:
+        """Read and drop data until the camera is silent. Return False for one that goes on, for 64 MiB or 0.5 s."""
         size = self.profile.transfer_bytes
-        reads = self.port.transfers(self.camera.endpoint_in, size, 1)
-        into, total = np.empty(size, np.uint8), 0
-        while total < _DRAIN_BYTES:
+        into, total, end = np.empty(size, np.uint8), 0, time.monotonic() + _MOST_DRAIN_S
+        while total < _DRAIN_BYTES and time.monotonic() < end:
+            reads = self.port.transfers(self.camera.endpoint_in, size, 1)
             reads.submit(into)
-            done = reads.wait(_DRAIN_S)
-            if done is None or not done.bytes:
-                break
-            total += done.bytes
-        return total + sum(done.bytes for done in reads.cancel())
+            done = reads.wait(_DRAIN_S)  # a slow camera takes longer to fill a read, whose bytes the cancelled one has
+            ended = [*([] if done is None else [done]), *reads.cancel()]
+            if not (n := sum(each.bytes for each in ended)):
+                return True
+            total += n
+        return False
 
     def transfers(self) -> Transfers:
         """Return new reads for one pass."""

@@ -199,6 +199,15 @@ def test_a_camera_that_sends_nothing_is_no_array() -> None:
     assert {f"close cam_{i:02d}" for i in range(2)} <= set(links["cam_00"].log)
 
 
+def test_a_camera_that_ignores_its_stop_sequence_is_refused() -> None:
+    """Its stream would begin anywhere in a frame after the second start."""
+    profile, _, links = make(2)
+    links["cam_00"].stops = False
+    with pytest.raises(UserError, match="camera cam_00: expected silence after its stop sequence, found it goes on"):
+        capture(profile, links, SECONDS)
+    assert "close cam_01" in links["cam_00"].log
+
+
 def test_an_interruption_before_the_first_tick_is_an_error() -> None:
     profile, _, links = make(2)
     stop = threading.Event()

@@ -14,6 +14,7 @@ from fake_camera import rig
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder import checks
+from spike4dgs.generators.recorder.usb import link as link_module
 from spike4dgs.generators.recorder.usb.link import Link, open_link
 from spike4dgs.generators.recorder.usb.ports import usb_ports
 from spike4dgs.generators.recorder.usb.reads import OK, SHORT, Completion
@@ -26,7 +27,7 @@ class FakePort:
 
     def __init__(self, serial: Any = "S0", speed: int = 4, address: int = 1) -> None:
         self.vendor_id, self.product_id, self.speed, self.where = 0x0403, 0x601F, speed, f"bus 2 address {address}"
-        self.name, self.refuses, self.ends = serial, None, list[Completion]()
+        self.name, self.refuses, self.ends, self.rest = serial, None, list[Completion](), list[Completion]()
         self.written, self.claimed = list[tuple[int, bytes]](), list[int]()
 
     def serial(self) -> str:
@@ -46,9 +47,14 @@ class FakePort:
 
     def transfers(self, endpoint: int, transfer_bytes: int, depth: int) -> Any:
         assert (endpoint, transfer_bytes) == (0x82, 1024)
-        rest = [Completion(7, 0, "cancelled")]
-        ends = iter(self.ends)
-        return SimpleNamespace(depth=depth, submit=lambda b: None, wait=lambda s: next(ends, None), cancel=lambda: rest)
+
+        def wait(seconds: float) -> Completion | None:
+            return self.ends.pop(0) if self.ends else None
+
+        def cancel() -> list[Completion]:
+            return [self.rest.pop(0)] if self.rest else []
+
+        return SimpleNamespace(depth=depth, submit=lambda b: None, wait=wait, cancel=cancel)
 
     def close(self) -> None:
         self.claimed.clear()
@@ -148,15 +154,20 @@ def test_a_link_starts_stops_and_drains_its_camera() -> None:
     link.stop()  # a camera that refuses it is left as it is
     assert port.written == [(0x02, b"a"), (0x02, b"b"), (0x02, b"refused")]
     port.ends = [Completion(1024, 0, OK), Completion(300, 0, SHORT)]
-    assert link.drain() == 1331, "with what a read has when it is cancelled"
+    port.rest = [Completion(0, 0, "cancelled"), Completion(0, 0, "cancelled"), Completion(7, 0, "cancelled")]
+    assert link.drain() and not port.ends and not port.rest, "with what a read has when it is cancelled"
     link.close()
     assert not port.claimed
 
 
-def test_a_camera_that_was_not_stopped_is_not_drained_for_ever() -> None:
+def test_a_camera_that_was_not_stopped_is_not_drained_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     port = FakePort()
     port.ends = [Completion(1 << 20, 0, OK)] * 100
-    assert opened(port).drain() == (64 << 20) + 7
+    assert not opened(port).drain() and len(port.ends) == 36
+    monkeypatch.setattr(link_module, "_MOST_DRAIN_S", 0.001)
+    slow = FakePort()  # whose reads never fill
+    slow.rest = [Completion(7, 0, "cancelled")] * 1_000_000
+    assert not opened(slow).drain()
 
 
 def test_a_refused_start_sequence_names_the_keys_to_check() -> None:
