@@ -216,7 +216,6 @@ _CONTENTS = {
     "  counts, `.npz`.",
     "calibration/dark": "`calibration/dark/CAMERA.dat`: a recording without light, packed like `spikes/`; or its\n"
     "  counts, `.npz`.",
-    "calibration/maps": "`calibration/maps/CAMERA.npz`: gain (mean 1) and dark rate (spikes per tick) as measured.",
     "truth": "`truth/CAMERA.npz`: the sensor's true gain and dark maps. Only for scoring a calibration.",
     "truth/array_path.json": "`truth/array_path.json`: transforms to the world that stands still from the frame of\n"
     "  the array, in which the cameras are given.",

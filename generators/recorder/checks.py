@@ -62,7 +62,7 @@ def check_machine(
 ) -> list[UserError]:
     """Return what this machine lacks to record `seconds` into the folder `out`, each as an error that states a fix.
 
-    Emulated cameras need no kernel memory for USB. `copied`: files that go there too, besides the profile's maps.
+    Emulated cameras need no kernel memory for USB. `copied`: files that go there too, besides the streams.
     """
     found = [] if emulated else [check_usb_memory(profile)]
     found += [check_memory(profile, seconds, continuous), check_disk(profile, seconds, out, copied)]
@@ -106,9 +106,8 @@ def check_memory(profile: RigProfile, seconds: float, continuous: bool, free: in
 def check_disk(profile: RigProfile, seconds: float, out: Path, copied: Collection[Path] = ()) -> UserError | None:
     """Check the disk space for the packed streams of all cameras, what is copied beside them, and a margin."""
     layout = make_layout(profile.layout, profile.width, profile.height)
-    maps = [c.maps for c in profile.cameras if c.maps] if profile.calibrated else []
     need = len(profile.cameras) * seconds * profile.fps * layout.payload_bytes + (16 << 20)
-    need += sum(path.stat().st_size for path in (*maps, *copied))
+    need += sum(path.stat().st_size for path in copied)
     folder = next(p for p in (out, *out.resolve().parents) if p.exists())
     free = shutil.disk_usage(folder).free
     if free >= need:

@@ -90,9 +90,6 @@ def _finish_streams(out: Path, profile: RigProfile, record: ClipRecord) -> None:
 
 def _finish_scene(out: Path, profile: RigProfile, record: ClipRecord) -> None:
     cameras = tuple(c.calibration for c in profile.cameras if c.calibration is not None)
-    for c in profile.cameras:
-        if c.maps:
-            _copy(c.maps, out / f"calibration/maps/{c.id}.npz")
     for name, path in record.files.items():
         _copy(path, out / name)
     name, splits = out.resolve().name, record.splits

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.cameras import Camera, check_lens, check_rotation
 from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
 from spike4dgs.benchmark.spikes.sensor_model import MOST_DEAD_TICKS
-from spike4dgs.benchmark.untrusted import ID, MAX_SIDE, Expected, check_ids, is_id, read_npz, shown
+from spike4dgs.benchmark.untrusted import ID, MAX_SIDE, check_ids, is_id, shown
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.toml_table import (
     FLAG,
@@ -114,7 +114,6 @@ class CameraProfile:
     rows: str = BOTTOM_UP  # or "top-down"
     mirrored: bool = False
     calibration: Camera | None = None  # intrinsics and pose
-    maps: Path | None = None  # .npz with gain [H, W] and dark [H, W] (spikes per tick), as `calibrate` writes it
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +199,7 @@ def _read_cameras(top: Table, width: int, height: int) -> tuple[CameraProfile, .
     shared = defaults.rest() if defaults else {}
     name = top.get("calibration", TEXT, None)
     known = read_calibration(folder / name, width, height) if name else {}
-    if unique := {"id", "serial", "calibration", "maps"} & set(shared):
+    if unique := {"id", "serial", "calibration"} & set(shared):
         raise top.error(f"defaults.{min(unique)}", "common keys of the cameras", "a key of each camera", "move it")
     tables = top.tables("camera")
     if not tables:
@@ -213,29 +212,15 @@ def _read_camera(table: Table, known: dict[str, Camera], width: int, height: int
     own = table.table("calibration")
     if own and id in known:
         raise table.error("calibration", "one calibration of a camera", "another in the profile's calibration file")
-    maps = table.get("maps", TEXT, None)
     camera = CameraProfile(
         id=id,
         **table.fields(_CAMERA, ("serial", "vendor_id", "product_id", "endpoint_in")),
         calibration=_read_calibration(own, id, width, height) if own else known.get(id),
-        maps=table.path.parent / maps if maps else None,
     )
     table.close()
     if (camera.start or camera.stop) and camera.endpoint_out is None:
         raise table.error("endpoint_out", "an endpoint for the start and stop sequences", "none", "add it")
-    if camera.maps:
-        _check_maps(camera.maps, width, height)
     return camera
-
-
-def _check_maps(path: Path, width: int, height: int) -> None:
-    """Raise UserError unless the file has finite maps `gain` (mean 1) and `dark` (spikes per tick), each [H, W]."""
-    what = f"an .npz of the maps gain and dark, {width}x{height} pixels each"
-    fix = "make it with `spike4dgs calibrate`"
-    shapes = dict.fromkeys(("gain", "dark"), Expected("fiu", (height, width)))
-    for name, image in read_npz(path, what, shapes, fix).items():
-        if not np.isfinite(image).all():
-            raise problem(path, what, f"{name} not finite", fix)
 
 
 def _read_calibration(table: Table, id: str, width: int, height: int) -> Camera:
@@ -268,9 +253,18 @@ def _array(value: Any, shape: tuple[int, ...]) -> Float64:
 def _check_whole(top: Table, p: RigProfile) -> None:
     """Check facts across keys: names used twice, roles, sizes that do not go together."""
     try:
-        make_layout(p.layout, p.width, p.height)
+        layout = make_layout(p.layout, p.width, p.height)
     except UserError as e:
         raise UserError(f"{top.path}, key layout: {e}") from None
+    if not layout.has_tags and (unknown := [c.id for c in p.cameras if not c.start]):
+        expected = f"a start sequence, after which a frame of layout {p.layout} begins"
+        raise top.error("camera.start", expected, f"none of {', '.join(unknown)}", "add it, or take a layout with tags")
+    if (read_ms := 1e3 * p.transfer_bytes / (p.fps * layout.frame_bytes)) > p.timeout_ms / 2:
+        expected, fix = (
+            f"reads that last half of timeout_ms ({p.timeout_ms}) at most",
+            "lower bytes or raise timeout_ms",
+        )
+        raise top.error("transfer.bytes", expected, f"{read_ms:.0f} ms for {p.transfer_bytes} bytes", fix)
     for key, names in (("id", [c.id for c in p.cameras]), ("serial", [c.serial for c in p.cameras])):
         if twice := _twice(names):
             raise top.error(f"camera.{key}", "another one for each camera", f"{twice!r} twice")

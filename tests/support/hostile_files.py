@@ -369,11 +369,10 @@ def make_recording(folder: Path) -> None:
     from spike4dgs.benchmark.spikes.gaps import Gap
     from spike4dgs.benchmark.spikes.stream import open_stream, pack
 
-    rig, more = POSED, {'role = "primary"': 'maps = "left.npz"', "3.5]": "distortion = [0.01, 0.0]"}
+    rig, more = POSED, {"3.5]": "distortion = [0.01, 0.0]"}
     for line, after in (more | {'"plain"': 'fps = 20000\nheld_out = ["left"]'}).items():
         rig = rig.replace(line, f"{line}\n{after}")
     (folder / "rig.toml").write_text(rig)
-    np.savez_compressed(folder / "left.npz", gain=np.ones((24, 40)), dark=np.zeros((24, 40)))
     streams = {}
     for name in ("left", "right"):
         pack(np.zeros((16, 24, 40), bool)).tofile(folder / f"{name}.dat")

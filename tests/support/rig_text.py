@@ -15,6 +15,8 @@ in_flight = 2
 vendor_id = 0x0403
 product_id = 0x601f
 endpoint_in = 0x82
+endpoint_out = 0x01
+start = ["00 01"]
 
 [[camera]]
 id = "left"

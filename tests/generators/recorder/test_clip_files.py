@@ -205,17 +205,14 @@ def test_a_rig_without_poses_records_a_folder_of_streams(tmp_path: Path) -> None
     assert facts["source"]["kind"] == "recorder" and facts["sync"]["method"] == "frame tags"
 
 
-def test_maps_and_files_become_part_of_the_scene(tmp_path: Path) -> None:
-    np.savez(tmp_path / "maps.npz", gain=np.ones((HEIGHT, WIDTH)), dark=np.zeros((HEIGHT, WIDTH)))
+def test_files_become_part_of_the_scene(tmp_path: Path) -> None:
     (tmp_path / "note").write_text("from elsewhere")
     pose = array_cameras(1, WIDTH, HEIGHT)[0]
-    profile = RigProfile("r", WIDTH, HEIGHT, "plain", (camera("cam_00", calibration=pose, maps=tmp_path / "maps.npz"),))
+    profile = RigProfile("r", WIDTH, HEIGHT, "plain", (camera("cam_00", calibration=pose),))
     record = ClipRecord(TICKS, (), SYNC, files={"truth/note": tmp_path / "note"})
     root = write_clip(tmp_path / "clip", profile, {"cam_00": pack(spikes(0))}, record)
-    listed = open_scene(root).manifest.files
-    assert {"calibration/maps/cam_00.npz", "truth/note"} <= set(listed)
-    assert (root / "calibration/maps/cam_00.npz").read_bytes() == (tmp_path / "maps.npz").read_bytes()
-    assert "calibration/maps" in (root / "README.md").read_text()
+    assert "truth/note" in open_scene(root).manifest.files
+    assert (root / "truth/note").read_text() == "from elsewhere"
 
 
 # ---------------------------------------------------------------- errors

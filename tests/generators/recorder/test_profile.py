@@ -54,9 +54,9 @@ def test_every_key_of_a_whole_profile_is_explained() -> None:
 def test_defaults_and_own_keys(tmp_path: Path) -> None:
     rig = load_profile(save(tmp_path, RIG))
     left, right = rig.cameras
-    assert (left.endpoint_in, left.endpoint_out, left.interface, left.control_interface) == (0x82, None, 0, None)
+    assert (left.endpoint_in, left.endpoint_out, left.interface, left.control_interface) == (0x82, 0x01, 0, None)
     assert (left.role, right.role, left.rows, right.rows) == ("primary", "secondary", "bottom-up", "top-down")
-    assert (left.start, left.stop, left.mirrored, left.calibration, left.maps) == ((), (), False, None, None)
+    assert (left.start, left.stop, left.mirrored, left.calibration) == ((b"\x00\x01",), (), False, None)
     assert (rig.transfer_bytes, rig.transfers, rig.ring_seconds, rig.timeout_ms) == (1024, 2, None, 500)
     assert not rig.calibrated and rig.camera("right") is right
 
@@ -102,6 +102,9 @@ def cut(old: str, new: str = "") -> Callable[[str], str]:
     return change
 
 
+no_start = cut('start = ["00 01"]\n')
+
+
 @pytest.mark.parametrize(
     ("change", "key", "message"),
     [
@@ -127,10 +130,14 @@ def cut(old: str, new: str = "") -> Callable[[str], str]:
         (cut("[defaults]", "[defaults]\nserial = 'A1'"), "defaults.serial", "a key of each camera"),
         (cut("endpoint_in = 0x82"), "camera[0].endpoint_in", "found no such key"),
         (cut("0x82", "0x02"), "camera[0].endpoint_in", "whole number from 129 to 143, found 2"),
-        (cut("0x82", '0x82\nstart = ["00"]'), "camera[0].endpoint_out", "for the start and stop sequences"),
-        (cut("0x82", '0x82\nendpoint_out = 1\nstop = ["0"]'), "camera[0].stop", "hexadecimal digits"),
-        (cut("0x82", '0x82\nendpoint_out = 1\nstart = "00"'), "camera[0].start", "a list of commands"),
-        (cut("0x82", "0x82\nstart = [' ']"), "camera[0].start", "a list of commands"),
+        (cut("endpoint_out = 0x01\n"), "camera[0].endpoint_out", "for the start and stop sequences"),
+        (cut("0x82", '0x82\nstop = ["0"]'), "camera[0].stop", "hexadecimal digits"),
+        (cut('["00 01"]', '"00"'), "camera[0].start", "a list of commands"),
+        (cut("00 01", " "), "camera[0].start", "a list of commands"),
+        (cut('start = ["00 01"]\n'), "camera.start", "after which a frame of layout plain begins, found none of left"),
+        (lambda text: no_start(text).replace('"plain"', '"tagged-rows"'), None, None),
+        (cut("1024", "1048576"), "transfer.bytes", "reads of half of timeout_ms (500) at most, found 437 ms for 1048576 bytes"),
+        (cut("1024", "1048576\ntimeout_ms = 1000"), None, None),
         (cut('"left"', '"../left"'), "camera[0].id", "a name of letters"),
         (cut('"left"', '"right"'), "camera.id", "found 'right' twice"),
         (cut('"A1"', '"A2"'), "camera.serial", "found 'A2' twice"),
@@ -180,20 +187,6 @@ def test_files_that_are_no_profiles(tmp_path: Path) -> None:
         load_profile(tmp_path / "none.toml")
     with pytest.raises(UserError, match="found a folder"):
         load_profile(tmp_path)
-
-
-def test_maps_are_checked_before_a_recording(tmp_path: Path) -> None:
-    rig = save(tmp_path, RIG + 'maps = "right.npz"')
-    with pytest.raises(UserError, match=r"right\.npz: expected an .npz of the maps gain and dark, 40x24.*no such file"):
-        load_profile(rig)
-    (tmp_path / "right.npz").write_bytes(b"PK\x03\x04 no archive")
-    with pytest.raises(UserError, match="damaged data"):
-        load_profile(rig)
-    np.savez(tmp_path / "right.npz", gain=np.ones((24, 40)), dark=np.ones((2, 40)))
-    with pytest.raises(UserError, match=r"found dark of shape \(2, 40\)"):
-        load_profile(rig)
-    np.savez(tmp_path / "right.npz", gain=np.ones((24, 40)), dark=np.zeros((24, 40)))
-    assert load_profile(rig).cameras[1].maps == tmp_path / "right.npz"
 
 
 def test_both_a_calibration_file_and_one_of_its_own_is_refused(tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ def rig_of(scene, folder: Path) -> Path:
     text = RIG.partition("[[camera]]")[0].replace('"plain"', '"tagged-rows"').replace("bytes = 1024", "bytes = 4096")
     facts = 'radiance_gain = 0.6\nheld_out = ["cam_03"]\ncalibration = "calibration.toml"\n[transfer]'
     text = text.replace("[transfer]", facts)
-    text += 'endpoint_out = 0x01\nstart = ["01"]\nstop = ["02"]\nmirrored = true\n'
+    text += 'stop = ["02"]\nmirrored = true\n'
     for i, name in enumerate(cameras):
         text += f'[[camera]]\nid = "{name}"\nserial = "S{i}"\nrole = "{"secondary" if i else "primary"}"\n'
     (folder / "rig.toml").write_text(text)
