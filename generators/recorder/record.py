@@ -27,7 +27,7 @@ from spike4dgs.generators.recorder.clip_files import StreamFiles
 from spike4dgs.generators.recorder.clip_record import ClipRecord
 from spike4dgs.generators.recorder.disk import BUFFER_BYTES
 from spike4dgs.generators.recorder.emulation.imperfections import PERFECT, Imperfections
-from spike4dgs.generators.recorder.frames.clip import Clip, Sink
+from spike4dgs.generators.recorder.frames.clip import FRAME_TAGS, Clip, Sink
 from spike4dgs.generators.recorder.preview import Watch, write_sheet
 from spike4dgs.generators.recorder.resources import buffer_seconds, bytes_per_s, real_time
 from spike4dgs.generators.recorder.rig_calibration.board_views import open_recording
@@ -49,6 +49,7 @@ from spike4dgs.generators.recorder.usb.ports import Port, usb_ports
 from spike4dgs.generators.recorder.usb.reads import OK
 
 LOST_DATA = 3  # exit code
+_ENDING = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 _PATIENCE = 3  # presses of Ctrl-C that abort even the writing of captured data
 
 
@@ -214,7 +215,10 @@ def _sink(files: StreamFiles, stop: threading.Event) -> Sink:
 
 @contextmanager
 def _interruptible() -> Iterator[threading.Event]:
-    """Make Ctrl-C set the event, which ends a capture; captured data are still written, unless the user insists."""
+    """Make Ctrl-C set the event, which ends a capture; captured data are still written, unless the user insists.
+
+    A request to end and the end of a terminal do the same.
+    """
     stop, presses = threading.Event(), 0
 
     def press(number: int, frame: FrameType | None) -> None:
@@ -224,11 +228,13 @@ def _interruptible() -> Iterator[threading.Event]:
         if presses >= _PATIENCE:
             raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, press)
+    numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+    before = {number: signal.signal(number, press) for number in numbers}
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _described(clip: Clip, sync: SyncReport, known: Truth) -> ClipRecord:
@@ -259,18 +265,21 @@ def _print(clip: Clip, sync: SyncReport, continuous: bool) -> None:
 
     console, fits = Console(width=120), {fit.camera: fit for fit in sync.cameras}
     title = f"synchronised by {sync.method}" + (", ended early" if clip.interrupted else "")
-    columns = "camera", "MB", "lost ticks", "drift, ppm", "offset, us", "fullest buffer", "no read, ms", "end"
+    columns = "camera", "MB", "lost ticks", "drift, ppm", "offset, us (ticks)", "fullest buffer", "no read, ms", "end"
     table = Table(*columns, title=title)
     for c in clip.cameras:
         s, fit = c.stats, fits[c.camera]
         buffer = f"{s.backlog / s.slots:.0%}" if continuous else "-"  # else it holds the whole clip
         idle = f"{s.idle_mean_ms:.2f}, worst {s.idle_worst_ms:.2f}"
-        row = [c.camera, f"{s.bytes / 1e6:.1f}", f"{s.lost_ticks}", fit.drift_text, f"{fit.offset_us:+.0f}"]
+        row = [c.camera, f"{s.bytes / 1e6:.1f}", f"{s.lost_ticks}", fit.drift_text, fit.offset_text]
         table.add_row(*row, buffer, idle, s.end, style="red" if c.gaps else None)
     console.print(table)
     if any(fit.too_short for fit in sync.cameras):
         print("the clip is too short to tell the drift of every clock; a second or more tells it")
     if sync.worst_pair:
         print(f"the arrival times of {' and '.join(sync.worst_pair)} differ most, by {sync.worst_pair_us:.0f} us")
+    if apart := ", ".join(fit.camera for fit in sync.cameras if fit.apart):
+        contradiction = ", which the frame tags contradict" if sync.method == FRAME_TAGS else ""
+        print(f"tick 0 of {apart} arrived far from the others'{contradiction}: check the trigger cable")
     for gap in (gap for c in clip.cameras for gap in c.gaps):
         print(f"gap: {gap.camera} from tick {gap.first_tick}, {gap.ticks} ticks ({gap.reason})")

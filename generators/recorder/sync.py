@@ -91,6 +91,8 @@ TELLING_PPM = 50.0  # a larger standard error than crystals' own differences tel
 # In such a clip, delays that grow or shrink look like drift, many times beyond its standard error: up to 16 of them in
 # 20 ms. Only a rate that is wrong altogether is a hundred away.
 _ERRORS, _ERRORS_TOO_SHORT = 3, 100
+_APART_US = 20_000.0  # a computer's delays reach it; cameras on one trigger start within microseconds
+_READS, _SCATTERS = 2, 5  # within which cameras that cannot be stopped begin
 _MOST_READS = 400  # of each camera that are used: all pairs of them are compared
 
 
@@ -102,6 +104,8 @@ class ArrivalFit:
     drift_ppm: float  # time per tick over the nominal one, less 1; positive: the camera is slow
     drift_error_ppm: float  # standard error of it, from the scatter of the arrivals
     offset_us: float  # time of tick 0, less the array's median
+    offset_ticks: float  # the same
+    read_us: float  # the time of a read, the median
     residual_us: float  # median distance of an arrival from the line
     worst_us: float  # largest one
     reads: int
@@ -113,6 +117,16 @@ class ArrivalFit:
 
     @property
     def suspect(self) -> bool:
+        """True if this is no camera of the array, with one trigger and one rate."""
+        return self.wrong_rate or self.apart
+
+    @property
+    def apart(self) -> bool:
+        """True if tick 0 is farther from the array's than reads and the scatter of the arrivals explain."""
+        return abs(self.offset_us) > max(_APART_US, _READS * self.read_us + _SCATTERS * self.residual_us)
+
+    @property
+    def wrong_rate(self) -> bool:
         """True if the rate is off by more than crystals can be, beyond the scatter of the arrivals."""
         errors = _ERRORS_TOO_SHORT if self.too_short else _ERRORS
         return abs(self.drift_ppm) - errors * self.drift_error_ppm > SUSPECT_PPM
@@ -120,9 +134,14 @@ class ArrivalFit:
     @property
     def drift_text(self) -> str:
         """The drift for people, with its standard error, or that the clip is too short to tell."""
-        if self.too_short and not self.suspect:
+        if self.too_short and not self.wrong_rate:
             return "too short to tell"
-        return f"{self.drift_ppm:+.0f} +- {self.drift_error_ppm:.0f}" + (" suspect" if self.suspect else "")
+        return f"{self.drift_ppm:+.0f} +- {self.drift_error_ppm:.0f}" + (" suspect" if self.wrong_rate else "")
+
+    @property
+    def offset_text(self) -> str:
+        """The offset for people, in microseconds and ticks."""
+        return f"{self.offset_us:+.0f} ({self.offset_ticks:+.0f})" + (" suspect" if self.apart else "")
 
 
 @dataclass(frozen=True)
@@ -153,6 +172,8 @@ def fit_arrival(clip: Clip, rate_hz: float) -> SyncReport:
             drift_ppm=(line.slope / nominal_ns - 1) * 1e6,
             drift_error_ppm=line.slope_error / nominal_ns * 1e6,
             offset_us=(line.height - middle) * 1e-3,
+            offset_ticks=(line.height - middle) / nominal_ns,
+            read_us=line.read_ticks * nominal_ns * 1e-3,
             residual_us=line.residual * 1e-3,
             worst_us=line.worst * 1e-3,
             reads=line.points,
@@ -176,13 +197,14 @@ class _Line:
     height: float  # ns, at tick 0
     residual: float
     worst: float
+    read_ticks: float
     points: int
 
 
 def _theil_sen(arrival: NDArray[np.float64]) -> _Line:
     """Return the median of all slopes between two of the points (tick, ns) [m, 2], and the median height."""
     if len(arrival) < 3 or np.ptp(arrival[:, 0]) == 0:
-        return _Line(math.nan, math.nan, math.nan, math.nan, math.nan, len(arrival))
+        return _Line(*[math.nan] * 6, len(arrival))
     used = arrival[np.linspace(0, len(arrival) - 1, min(len(arrival), _MOST_READS)).astype(int)]
     base = used[0, 1]  # CLOCK_MONOTONIC in ns needs more digits than the differences
     x, y = used[:, 0], used[:, 1] - base
@@ -197,7 +219,8 @@ def _theil_sen(arrival: NDArray[np.float64]) -> _Line:
     error = 1.4826 * residual * math.sqrt(math.pi / 2) / (math.sqrt(len(x)) * float(np.std(x)))
     if len(x) < 4:  # the median slope of three is that of two, through which a line has no scatter
         error = math.nan
-    return _Line(slope, error, height + float(base), residual, float(away.max()), len(arrival))
+    read_ticks = float(np.median(np.diff(arrival[:, 0])))
+    return _Line(slope, error, height + float(base), residual, float(away.max()), read_ticks, len(arrival))
 
 
 def _without_nan(value: Any) -> Any:

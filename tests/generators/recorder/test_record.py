@@ -25,7 +25,9 @@ from spike4dgs.generators.recorder import record as command
 from spike4dgs.generators.recorder import sources
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray
 from spike4dgs.generators.recorder.emulation.camera import Fault
+from spike4dgs.generators.recorder.frames.clip import CameraClip, CameraStats, Clip
 from spike4dgs.generators.recorder.rig_profile import calibration_toml
+from spike4dgs.generators.recorder.sync import fit_arrival
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +151,34 @@ def test_ctrl_c_keeps_the_captured_ticks(scene, tmp_path, monkeypatch, capsys):
     ticks = np.arange(capture.n_ticks) % 80  # an emulated camera repeats its stream after the last tick
     for camera in source.cameras:
         np.testing.assert_array_equal(capture.stream(camera).packed, source.stream(camera).packed[ticks])
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no such signal")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_request_to_end_and_a_closed_terminal_end_a_recording_like_ctrl_c(name):
+    number = getattr(signal, name)
+    before = signal.signal(number, signal.SIG_IGN)  # the test's process must survive it
+    try:
+        with command._interruptible() as stop:
+            signal.raise_signal(number)
+            assert stop.is_set()
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+
+
+def test_cameras_without_a_trigger_are_told_of(capsys):
+    ticks = 20 * (1 + np.arange(100))
+    arrival = [np.stack([ticks, ticks * 50_000 + late], axis=1) for late in (0, 0, 120_000_000)]
+    stats = CameraStats(0, 0, 0, 0, 1, 0, 0.0, 0.0, 0, "ok")
+    nothing = np.empty((0, 1), np.uint8), np.empty(0, np.int64), ()
+    cameras = tuple(CameraClip(f"cam_{i}", *nothing, a, stats) for i, a in enumerate(arrival))
+    for sync in ("frame tags", "arrival times"):
+        clip = Clip(2000, cameras, sync, False)
+        command._print(clip, fit_arrival(clip, 20000), False)
+        said = capsys.readouterr().out
+        assert "tick 0 of cam_2 arrived far from the others'" in said and "check the trigger cable" in said
+        assert ("which the frame tags contradict" in said) == (sync == "frame tags")
 
 
 def test_only_the_third_ctrl_c_breaks_off_the_writing():

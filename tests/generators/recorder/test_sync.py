@@ -96,6 +96,16 @@ def test_a_rate_that_no_crystal_has_is_suspect() -> None:
     assert found.as_dict()["suspect"] == ["b"]
 
 
+def test_a_camera_that_began_at_another_time_is_suspect() -> None:
+    late = np.random.default_rng(5).exponential(30.0, 500)
+    found = fit_arrival(clip_of({name: arrivals(0, 120_000 * (name == "c"), late) for name in "abc"}, 10_000), FPS)
+    assert found.as_dict()["suspect"] == ["c"]
+    assert found.cameras[2].offset_text == "+120000 (+2400) suspect" and found.cameras[2].read_us == 1000
+    assert found.cameras[2].drift_text.endswith(str(round(found.cameras[2].drift_error_ppm))), "its rate is not"
+    near = fit_arrival(clip_of({name: arrivals(0, 15_000 * (name == "c"), late) for name in "abc"}, 10_000), FPS)
+    assert not near.as_dict()["suspect"], "as where cameras go on from the rehearsal"
+
+
 def test_a_clip_too_short_to_tell_says_so_instead_of_a_number() -> None:
     rng = np.random.default_rng(3)
     for n in (20, 100):  # 20 and 100 ms at 20 kHz, read in bursts; delays grow by a millisecond on the way
