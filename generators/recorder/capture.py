@@ -46,7 +46,8 @@ def capture(
 
     A rehearsal comes first: each camera is started, must deliver a block, and is stopped again. Then the secondaries
     are started before the primary, and every camera's first byte begins its first frame. Where a camera cannot be
-    stopped, all cameras continue from the rehearsal, and tick 0 is the first whole frame after TRIGGERED.
+    stopped, all cameras continue from the rehearsal. Tick 0 is then the first that the counters of all cameras have in
+    common; without these, each camera's first whole frame of a read that ended after TRIGGERED.
 
     Without `sink` all frames stay in memory and `frames` are views of it. With it (continuous mode) a thread passes
     whole frames on during the capture. While the sink waits, `ring_seconds` of data wait in memory; beyond them ticks
@@ -163,7 +164,7 @@ class _Capture:
             sound = [n for c in going_on if (n := cutters[c].next_tick)]
             n_ticks = min(n_ticks, min(sound) if sound else max(c.next_tick for c in cutters.values()))
         if n_ticks <= 0 or not any(c.next_tick for c in self.cutters.values()):
-            raise _nothing()
+            raise self._unlike() or _nothing()
         cameras = [self._camera_clip(c.id, runs[c.id], n_ticks) for c in self.profile.cameras if c.id in self.links]
         return Clip(n_ticks, tuple(cameras), self.sync, self.interrupted)
 
@@ -224,10 +225,13 @@ class _Capture:
             self.sync = ARRIVAL_TIMES if origin is None else FRAME_TAGS
         for camera, reader in self.readers.items():
             first = found.get(camera) or self._unknown_first(reader, origin or 0)
+            size = self.layout.frame_bytes
             ahead = 0 if origin is None else (origin - first.counter) % COUNTER
-            reader.wanted = first.position + (ahead + self.n_ticks) * self.layout.frame_bytes
+            # A camera that was started begins with a whole frame: the bytes before a later one are of lost ticks.
+            tick = -(-first.position // size) if origin is None and self.restart else 0
+            reader.wanted = first.position + (ahead + self.n_ticks - tick) * size
             ring = self.rings[camera]
-            self.cutters[camera] = Cutter(camera, self.layout, ring, origin, first.lead, self.from_start)
+            self.cutters[camera] = Cutter(camera, self.layout, ring, origin, first.lead, self.from_start, tick)
         if self.sink is not None:
             self.delivery = Delivery(self.sink, self.rings, self.cutters, self.n_ticks)
 
@@ -264,6 +268,15 @@ class _Capture:
             end=end,
         )
         return CameraClip(camera, frames, ticks, gaps, cutter.arrival, stats)
+
+    def _unlike(self) -> UserError | None:
+        """Return the error for data that hold no frame of the layout; None where too few arrived."""
+        p, size = self.profile, self.layout.frame_bytes
+        most, camera = max((r.ring.position - (r.origin or 0), c) for c, r in self.readers.items())
+        if not self.layout.has_tags or most < 2 * size:
+            return None
+        expected, found = f"frames of layout {p.layout}, {p.width}x{p.height}", f"{most / 1e6:.3g} MB without one"
+        return problem(f"camera {camera}", expected, found, "correct layout, width or height in the rig profile")
 
     @staticmethod
     def _raise_error(reader: Reader) -> None:

@@ -102,7 +102,7 @@ class StreamFiles:
         for start in range(0, len(frames), _FRAMES):
             raw = frames[start : start + _FRAMES]
             packed = raw
-            if self._layout.has_tags:
+            if not self._layout.packed:
                 packed = self._unpacked[: len(raw)]
                 self._layout.unpack(raw, packed)
             self.append(camera, first_tick + start, orient(packed, p.width, p.height, c.rows == TOP_DOWN, c.mirrored))

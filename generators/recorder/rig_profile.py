@@ -260,10 +260,7 @@ def _check_whole(top: Table, p: RigProfile) -> None:
         expected = f"a start sequence, after which a frame of layout {p.layout} begins"
         raise top.error("camera.start", expected, f"none of {', '.join(unknown)}", "add it, or take a layout with tags")
     if (read_ms := 1e3 * p.transfer_bytes / (p.fps * layout.frame_bytes)) > p.timeout_ms / 2:
-        expected, fix = (
-            f"reads that last half of timeout_ms ({p.timeout_ms}) at most",
-            "lower bytes or raise timeout_ms",
-        )
+        expected, fix = f"reads of half of timeout_ms ({p.timeout_ms}) at most", "lower bytes or raise timeout_ms"
         raise top.error("transfer.bytes", expected, f"{read_ms:.0f} ms for {p.transfer_bytes} bytes", fix)
     for key, names in (("id", [c.id for c in p.cameras]), ("serial", [c.serial for c in p.cameras])):
         if twice := _twice(names):

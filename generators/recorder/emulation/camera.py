@@ -84,7 +84,7 @@ class EmulatedCamera:
         self.changed = threading.Condition()  # held while the state is used, and notified when it changes
         self._source = orient(source, rig.width, rig.height, camera.rows == TOP_DOWN, camera.mirrored)
         self._frame = self.layout.frame_bytes
-        self._wire = None if self.layout.has_tags else self._source.reshape(-1)
+        self._wire = self._source.reshape(-1) if self.layout.packed else None
         self._rate = None if ticks_per_s is None else ticks_per_s * self._frame  # bytes per second
         self._all_faults, self._memory = tuple(faults), memory_bytes
         self._starts = 0

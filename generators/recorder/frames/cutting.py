@@ -22,8 +22,8 @@ SKEW_S = 0.1
 class Cutter:
     """Cuts one camera's blocks into frames, and records which tick was complete when each read ended.
 
-    `origin` and `from_start` are those of `TickCounter`. `lead` bytes are dropped first: those of a frame that began
-    before the recording.
+    `origin`, `from_start` and `first_tick` are those of `TickCounter`. `lead` bytes are dropped first: those of a frame
+    that began before the recording.
     """
 
     def __init__(
@@ -34,10 +34,11 @@ class Cutter:
         origin: int | None = None,
         lead: int = 0,
         from_start: bool = False,
+        first_tick: int = 0,
     ) -> None:
         self.next_tick = 0  # after the last frame
         self._arrival = array("q")  # pairs; hours of reads fit into memory
-        self._counter = TickCounter(layout, camera, origin, from_start)
+        self._counter = TickCounter(layout, camera, origin, from_start, first_tick)
         self._frame_bytes, self._lead = layout.frame_bytes, lead
         self._flat = ring.memory.reshape(-1)
         self._base = self._flat.ctypes.data

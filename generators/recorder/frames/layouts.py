@@ -3,6 +3,7 @@
 | name | frame | torn frames are detected by | frames are counted by |
 |---|---|---|---|
 | `plain` | the packed tick, ceil(W H / 8) bytes (400x250: 12,500) | nothing | nothing |
+| `padded-rows` | rows of W pixels and 16 bits without a meaning (400x250: 13,000) | nothing | nothing |
 | `tagged-rows` | rows of W pixels and 16 tag bits (400x250: 250 rows of 52 bytes, 13,000) | tags | tags, modulo 2^32 |
 | `line-tagged` | blocks of W / 2 pixels and 12 tag bits (1000x1000: 2000 of 64 bytes, 128,000) | tags | nothing |
 
@@ -16,7 +17,7 @@ row to row, which no image does. Two rows give n modulo 2^32 (59 hours at 20 kHz
 odd, rows of frames n and n + m disagree for every m that is not a multiple of 2^16. A frame that begins with one and
 ends with the other is therefore detected, with two exceptions: if they meet within the first row, whose tag comes after
 its pixels, or, in the dark and with a zero tag (n a multiple of 2^16), within the second row. The tick is correct even
-then. A camera with other tags needs another class here.
+then. A camera with other tags needs another class here, or is recorded as `padded-rows`.
 
 `line-tagged` is the published format of the 1000x1000 camera: a block's last word holds 4 pixels (bits 0..3), the line
 1..H/2 (bits 4..13) and the channel (14..15). Blocks come as (H/2, 0), (H/2, 1), (H/2 - 1, 0) ... (1, 1), then (1, 2),
@@ -47,7 +48,7 @@ from spike4dgs.generators.recorder.frames.layout_kernels import (
     unpack_lines,
 )
 
-PLAIN, TAGGED_ROWS, LINE_TAGGED = "plain", "tagged-rows", "line-tagged"
+PLAIN, PADDED_ROWS, TAGGED_ROWS, LINE_TAGGED = "plain", "padded-rows", "tagged-rows", "line-tagged"
 COUNTER = 1 << 32  # frame counters count modulo this
 _TAG_BYTES = 2
 
@@ -65,6 +66,11 @@ class Layout:
     frame_bytes: int
     has_tags: bool = False  # they locate and check frames; without tags a stream's first byte begins a frame
     count_tags: bool = False  # every frame carries a counter
+
+    @property
+    def packed(self) -> bool:
+        """True if a frame is its packed tick, and nothing else."""
+        return self.frame_bytes == self.payload_bytes
 
     @property
     def payload_bytes(self) -> int:
@@ -88,18 +94,10 @@ class Layout:
         return payload.copy()
 
 
-class _TaggedRows(Layout):
+class _PaddedRows(Layout):
     @property
     def _row_bytes(self) -> int:
         return self.width // 8 + _TAG_BYTES
-
-    def find(self, data: UInt8) -> int:
-        return int(find_tagged(rows(data), self.height, self._row_bytes))
-
-    def counts(self, raw: UInt8) -> Int64:
-        out = np.empty(len(raw), np.int64)
-        count_tagged(rows(raw), self.height, self._row_bytes, out)
-        return out
 
     def unpack(self, raw: UInt8, out: UInt8) -> None:
         n, pixels = len(raw), self._row_bytes - _TAG_BYTES
@@ -108,14 +106,28 @@ class _TaggedRows(Layout):
         np.copyto(target, raw.reshape(n, self.height, self._row_bytes)[:, :, :pixels])
 
     def pack(self, payload: UInt8, first_count: int = 0) -> UInt8:
-        n, pixels = len(payload), self._row_bytes - _TAG_BYTES
-        raw = np.empty((n, self.height, self._row_bytes), np.uint8)
-        raw[:, :, :pixels] = payload.reshape(n, self.height, pixels)
+        raw = np.zeros((len(payload), self.height, self._row_bytes), np.uint8)
+        raw[:, :, :-_TAG_BYTES] = payload.reshape(len(payload), self.height, -1)
+        return raw.reshape(len(payload), self.frame_bytes)
+
+
+class _TaggedRows(_PaddedRows):
+    def find(self, data: UInt8) -> int:
+        return int(find_tagged(rows(data), self.height, self._row_bytes))
+
+    def counts(self, raw: UInt8) -> Int64:
+        out = np.empty(len(raw), np.int64)
+        count_tagged(rows(raw), self.height, self._row_bytes, out)
+        return out
+
+    def pack(self, payload: UInt8, first_count: int = 0) -> UInt8:
+        n = len(payload)
+        raw = super().pack(payload).reshape(n, self.height, self._row_bytes)
         counts = (first_count + np.arange(n)) % COUNTER
         low, high = counts % 65536, counts // 65536
         words = np.stack([low, high + MIX * low], axis=1)[:, np.arange(self.height) % 2]  # [n, H]
         words = (words + STEP * np.arange(self.height)) % 65536
-        raw[:, :, pixels], raw[:, :, pixels + 1] = words % 256, words // 256
+        raw[:, :, -2], raw[:, :, -1] = words % 256, words // 256
         return raw.reshape(n, self.frame_bytes)
 
 
@@ -139,7 +151,7 @@ class _LineTagged(Layout):
         return np.packbits(bits.reshape(n, -1), axis=1, bitorder="little")
 
 
-LAYOUTS = (PLAIN, TAGGED_ROWS, LINE_TAGGED)
+LAYOUTS = (PLAIN, PADDED_ROWS, TAGGED_ROWS, LINE_TAGGED)
 
 
 def make_layout(name: str, width: int, height: int) -> Layout:
@@ -151,10 +163,12 @@ def make_layout(name: str, width: int, height: int) -> Layout:
         raise problem(f"layout {name}", "a width and a height of a camera", size, "correct the size")
     if name == PLAIN:
         return Layout(PLAIN, width, height, bytes_per_tick(width, height))
-    if name == TAGGED_ROWS:
-        if width % 8 or height < 4:  # two rows give the counter, the others confirm it
-            expected = "a width that is a multiple of 8, and 4 rows or more"
+    if name in (PADDED_ROWS, TAGGED_ROWS):
+        if width % 8 or (name == TAGGED_ROWS and height < 4):  # two rows give the counter, the others confirm it
+            expected = "a width that is a multiple of 8" + ", and 4 rows or more" * (name == TAGGED_ROWS)
             raise problem(f"layout {name}", expected, size, fix)
+        if name == PADDED_ROWS:
+            return _PaddedRows(name, width, height, height * (width // 8 + _TAG_BYTES))
         return _TaggedRows(name, width, height, height * (width // 8 + _TAG_BYTES), has_tags=True, count_tags=True)
     if width % 16 != 8 or height % 2 or height // 2 >= 1 << LINE_BITS:
         expected = f"a width of 8 more than a multiple of 16, and an even height below {2 << LINE_BITS}"

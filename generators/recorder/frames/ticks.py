@@ -31,8 +31,8 @@ class TickCounter:
     """Cuts one camera's bytes into frames and numbers them.
 
     `origin`: the counter of tick 0, where the layout has counters and the cameras have agreed on one; frames before it
-    are dropped. Without it, the first whole frame is tick 0. `from_start`: the first byte begins tick 0, so that a loss
-    in it is one as at any other tick; without tags this is so always.
+    are dropped. Without it, the first whole frame is `first_tick`, and the ticks before it were torn. `from_start`: the
+    first byte begins tick 0, so that a loss in it is one as at any other tick; without tags this is so always.
 
     For example::
 
@@ -43,16 +43,18 @@ class TickCounter:
         gaps = counter.finish(n_ticks)
     """
 
-    def __init__(self, layout: Layout, camera: str, origin: int | None = None, from_start: bool = False) -> None:
+    def __init__(
+        self, layout: Layout, camera: str, origin: int | None = None, from_start: bool = False, first_tick: int = 0
+    ) -> None:
         self._layout, self._camera = layout, camera
         self._counter = None if origin is None else origin - 1  # of the last frame that was numbered
-        self._tick = -1  # of the same frame; without counters, of the last frame that arrived or was skipped
+        self._tick = first_tick - 1  # of the same frame; without counters, of the last that arrived or was skipped
         self._next = 0  # the tick after the last frame that was returned
         self._synced = from_start or not layout.has_tags  # whether the beginning of the next frame is known
         self._ended = False  # lost for good
         self._part = _NOTHING  # the beginning of a frame, or while out of step a possible one
         self._ahead = 0  # bytes to drop before the next frame begins
-        self._reason: str | None = None  # of the first loss that has not become a gap yet
+        self._reason: str | None = TORN_FRAME if first_tick else None  # of the first loss that has not become a gap yet
         self._gaps: list[Gap] = []
 
     def feed(self, data: UInt8) -> list[Run]:

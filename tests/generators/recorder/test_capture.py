@@ -15,6 +15,7 @@ from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder.capture import capture
 from spike4dgs.generators.recorder.frames.clip import ARRIVAL_TIMES, FRAME_TAGS, CameraClip
 from spike4dgs.generators.recorder.frames.cutting import agree
+from spike4dgs.generators.recorder.frames.gaps import Gap
 from spike4dgs.generators.recorder.frames.layouts import COUNTER
 from spike4dgs.generators.recorder.rig_profile import RigProfile
 from spike4dgs.generators.recorder.sync import Rate
@@ -189,6 +190,26 @@ def test_short_reads_between_frames_cost_no_memory_and_so_no_tick(layout: str) -
     for camera, source in zip(clip.cameras, frames, strict=True):
         assert camera.stats.short_reads > N // 3
         check_frames(camera, source, N)
+
+
+def test_a_loss_in_the_first_frame_shifts_no_tick_where_counters_are_the_cameras_own() -> None:
+    profile = rig(2, "tagged-rows")
+    frames = [frames_of(i, layout_of(profile), 2 * N, first) for i, first in enumerate((10, 3_000_000))]
+    links = rig_of([frames[0], np.delete(frames[1].reshape(-1), slice(5, 9))], profile)
+    clip = capture(profile, links, SECONDS)
+    assert clip.sync == ARRIVAL_TIMES and clip.n_ticks == N
+    for camera, source in zip(clip.cameras, frames, strict=True):
+        check_frames(camera, source, N)
+    assert [camera.gaps for camera in clip.cameras] == [(), (Gap("cam_01", 0, 1, "torn frame"),)]
+
+
+def test_data_without_a_frame_of_the_layout_are_told_of() -> None:
+    profile, _, links = make(2, "tagged-rows")
+    for i, link in enumerate(links.values()):
+        link.stream = np.random.default_rng(i).integers(0, 256, 2 * N * 50, dtype=np.uint8)
+    expected = r"camera cam_0\d: expected frames of layout tagged-rows, 24x10, found 0.0\d* MB without one; corr"
+    with pytest.raises(UserError, match=expected):
+        capture(profile, links, SECONDS)
 
 
 def test_a_camera_that_sends_nothing_is_no_array() -> None:

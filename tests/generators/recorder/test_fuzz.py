@@ -23,9 +23,9 @@ from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, Layout, make_l
 from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 from spike4dgs.generators.recorder.rig_profile import RigProfile, load_profile
 
-TAG_CASES, STREAM_CASES, PROFILE_CASES = 2000, 2000, 2000  # streams: for each of three layouts
+TAG_CASES, STREAM_CASES, PROFILE_CASES = 2000, 2000, 2000  # streams: for each layout
 BATCH = 100
-SIZES = {"plain": (13, 5), "tagged-rows": (16, 6), "line-tagged": (24, 4)}
+SIZES = {"plain": (13, 5), "padded-rows": (16, 3), "tagged-rows": (16, 6), "line-tagged": (24, 4)}
 
 
 def batches(cases: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -75,7 +75,8 @@ class Sent:
 def camera_stream(rng: np.random.Generator, layout: Layout) -> Sent:
     """Return frames with a few faults: bytes known to be dropped, bytes lost with and without a report, noise, repeats.
 
-    `plain` has no silent faults, which it cannot detect, and `line-tagged` one, which is not a whole number of frames.
+    Layouts without tags have no silent faults, which they cannot detect, and `line-tagged` one, which is not a whole
+    number of frames.
     """
     n, size = int(rng.integers(1, 14)), layout.frame_bytes
     first = int(rng.choice([0, 2**32 - 4, int(rng.integers(2**32))]))
@@ -86,7 +87,7 @@ def camera_stream(rng: np.random.Generator, layout: Layout) -> Sent:
     data = sent.frames.ravel()
     # Sometimes reading begins in the middle of a frame.
     at = piece = int(rng.integers(size)) if layout.has_tags and rng.random() < 0.3 else 0
-    silent = {"plain": 0, "line-tagged": 1, "tagged-rows": 3}[layout.name]
+    silent = {"plain": 0, "padded-rows": 0, "line-tagged": 1, "tagged-rows": 3}[layout.name]
     for cut in np.sort(rng.integers(at, data.size + 1, rng.integers(0, 5))).tolist():
         kind, amount = str(rng.choice(["skip", "lose", "silent", "noise", "again"])), int(rng.integers(1, 3 * size))
         cut = max(cut, at)
@@ -134,7 +135,7 @@ def check(layout: Layout, sent: Sent, rng: np.random.Generator) -> None:
         lead = int(rng.integers(-3, 4))
         origin = (sent.first_count + lead) % 2**32
     counter = TickCounter(layout, "cam_00", origin)
-    known = {"plain": 0, "tagged-rows": layout.width // 4 + 2, "line-tagged": layout.width // 16 + 2}[layout.name]
+    known = {"tagged-rows": layout.width // 4 + 2, "line-tagged": layout.width // 16 + 2}.get(layout.name, 0)
     runs, ticks = replay(counter, sent, rng), list[int]()
     # Pixels before the first tag that no dark image imitates are not protected.
     if runs and layout.has_tags and origin is None:  # the first whole frame is tick 0

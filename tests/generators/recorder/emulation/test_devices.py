@@ -18,7 +18,7 @@ from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.generators.recorder.emulation import camera as emulated_camera
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_streams
 from spike4dgs.generators.recorder.emulation.camera import EmulatedCamera, Fault
-from spike4dgs.generators.recorder.frames.layouts import make_layout
+from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
 from spike4dgs.generators.recorder.frames.orientation import orient
 
 
@@ -75,7 +75,7 @@ def test_reads_of_any_size_bring_the_stream_less_the_lost_bytes(
         assert into[: len(expected)].tobytes() == bytes(expected)
 
 
-@pytest.mark.parametrize("layout", ["plain", "tagged-rows", "line-tagged"])
+@pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize(("rows", "mirrored"), [("bottom-up", False), ("top-down", False), ("top-down", True)])
 def test_a_camera_sends_its_image_as_its_profile_says(two: Scene, layout: str, rows: str, mirrored: bool) -> None:
     profile = profile_of(two, layout=layout)

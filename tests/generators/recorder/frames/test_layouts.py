@@ -11,8 +11,8 @@ from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, Layout, make_l
 from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 
-SIZES = {"plain": (400, 250), "tagged-rows": (400, 250), "line-tagged": (1000, 1000)}
-SMALL = {"plain": (21, 5), "tagged-rows": (24, 6), "line-tagged": (24, 6)}
+SIZES = {"plain": (400, 250), "padded-rows": (400, 250), "tagged-rows": (400, 250), "line-tagged": (1000, 1000)}
+SMALL = {"plain": (21, 5), "padded-rows": (24, 3), "tagged-rows": (24, 6), "line-tagged": (24, 6)}
 
 
 def packed_ticks(width: int, height: int, n: int, seed: int = 0) -> np.ndarray:
@@ -51,6 +51,8 @@ def line_frame(payload: np.ndarray, width: int, height: int) -> list[int]:
 def twin(layout: Layout, payload: np.ndarray, count: int) -> list[int]:
     if layout.name == "tagged-rows":
         return tagged_frame(payload, layout.width, layout.height, count)
+    if layout.name == "padded-rows":
+        return np.pad(payload.reshape(layout.height, -1), ((0, 0), (0, 2))).ravel().tolist()
     return line_frame(payload, layout.width, layout.height) if layout.name == "line-tagged" else payload.tolist()
 
 
@@ -70,14 +72,15 @@ def test_frames_equal_those_of_the_slow_twin_both_ways(name: str, sizes: dict[st
 
 
 def test_published_frame_sizes() -> None:
-    assert [make_layout(name, *SIZES[name]).frame_bytes for name in LAYOUTS] == [12_500, 13_000, 128_000]
+    assert [make_layout(name, *SIZES[name]).frame_bytes for name in LAYOUTS] == [12_500, 13_000, 13_000, 128_000]
     assert make_layout("line-tagged", 1000, 1000).payload_bytes == 125_000
 
 
 @pytest.mark.parametrize(
     ("name", "width", "height", "message"),
     [
-        ("columns", 400, 250, "expected one of plain, tagged-rows, line-tagged, found 'columns'"),
+        ("padded-rows", 401, 250, "expected a width that is a multiple of 8, found"),
+        ("columns", 400, 250, "expected one of plain, padded-rows, tagged-rows, line-tagged, found 'columns'"),
         ("plain", 0, 250, "found 0x250"),
         ("tagged-rows", 401, 250, "expected a width that is a multiple of 8"),
         ("tagged-rows", 400, 3, "4 rows or more"),
@@ -200,6 +203,14 @@ def test_a_loss_in_the_first_frame_shifts_no_tick_where_the_first_byte_begins_it
         runs += counter.feed(frames.ravel()[size + 9 :])
         assert ticks_of(runs, frames) == (list(range(2, 20)) if layout.count_tags else [])
         assert counter.finish(20) == (Gap("cam_00", 0, 2 if layout.count_tags else 20, reason),)
+
+
+def test_what_pads_a_row_is_dropped() -> None:
+    layout, payload = make_layout("padded-rows", 400, 250), packed_ticks(400, 250, 2)
+    raw, out = layout.pack(payload), np.empty_like(payload)
+    raw.reshape(2, 250, 52)[:, :, 50:] = 0xA5
+    layout.unpack(raw, out)
+    np.testing.assert_array_equal(out, payload)
 
 
 def test_torn_frames_repeats_and_leaps_never_yield_a_wrong_tick() -> None:
