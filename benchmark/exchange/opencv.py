@@ -49,6 +49,7 @@ _DEPTH = 16  # of maps and lists in XML
 _COEFFICIENTS = (4, 5, 8, 12, 14)  # that OpenCV's lens model takes
 _NO_FISHEYE = (None, 0, "0")  # values of `fisheye_model`
 _FISHEYES = ("equidistant", "fisheye")  # values of `distortion_model`
+_BROWN = ("plumb_bob", "radtan", "rational_polynomial")  # others, of OpenCV's lens model
 _EXACT = 1e-9  # of the entries of a camera matrix that are 0 or 1
 
 
@@ -130,8 +131,9 @@ def _matrix(node: Values, keys: tuple[str, ...], name: str, path: Path) -> Float
         sizes = found["sizes"] if "sizes" in found else [found["rows"], found["cols"]]
         shape = tuple(whole(float(n), 1, _MOST_VALUES) for n in (sizes if isinstance(sizes, list) else [sizes]))
         values = np.array([float(value) for value in found["data"]], np.float64)
-        if found["dt"] not in _TYPES or math.prod(shape) != len(values) or len(values) > _MOST_VALUES:
-            raise ValueError(f"{len(values)} values of shape {shape}, type {shown(found['dt'])}")
+        kind = found.get("dt", "d")  # ROS leaves it out
+        if kind not in _TYPES or math.prod(shape) != len(values) or len(values) > _MOST_VALUES:
+            raise ValueError(f"{len(values)} values of shape {shape}, type {shown(kind)}")
         return values.reshape(shape)
     except (KeyError, TypeError, ValueError, OverflowError) as e:
         raise problem(path, f"a matrix {keys[0]} of {name}", str(e)[:200], "write it again") from None
@@ -168,7 +170,10 @@ def _is_plain(K: Float64) -> bool:
 
 
 def _with_lens(camera: Camera, node: Values, path: Path) -> FoundCamera:
-    fisheye = node.get("fisheye_model") not in _NO_FISHEYE or node.get("distortion_model") in _FISHEYES
+    if (model := node.get("distortion_model")) not in (None, *_BROWN, *_FISHEYES):
+        expected = f"a distortion_model of {camera.id} among {', '.join((*_BROWN, *_FISHEYES))}, or none"
+        raise problem(path, expected, shown(model), "calibrate with one of them")
+    fisheye = node.get("fisheye_model") not in _NO_FISHEYE or model in _FISHEYES
     if _get(node, _DISTORTION) is None:
         return FoundCamera(camera, fisheye_distortion(np.zeros(4)) if fisheye else None)
     coefficients = _matrix(node, _DISTORTION, camera.id, path).ravel()
