@@ -19,6 +19,7 @@ def import_dat(
     recording: OmitArgPrefixes[Recording],
     out: Path,
     cameras: Path | None = None,
+    row_columns: int | None = None,
 ) -> int:
     """Import a bare .dat file, or a folder of them (one per camera), as a folder of streams or a scene folder.
 
@@ -39,8 +40,12 @@ def import_dat(
         out: New folder to write.
         cameras: COLMAP model folder, OpenCV file or folder, or Kalibr file. COLMAP's unit of length is arbitrary; a
             scene's is the metre.
+        row_columns: Columns of a stored row, where it is longer than the image: 416 in raw dumps of the 400x250 camera.
+            Those beyond --width are dropped.
     """
-    streams = import_streams(path, out, width=width, height=height, recording=recording, cameras=cameras)
+    streams = import_streams(
+        path, out, width=width, height=height, recording=recording, cameras=cameras, row_columns=row_columns
+    )
     warn_of_size(streams)
     for stream in streams.values():
         print(f"{stream.source}: {stream.n_ticks} ticks of {width}x{height}")

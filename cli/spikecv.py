@@ -33,8 +33,8 @@ def import_spikecv(
 def export_spikecv(scene: Positional[Path], out: Path, allow_gaps: bool = False) -> int:
     """Write the streams of a scene as SpikeCV folders, one per camera, rows bottom-up (SpikeCV's default).
 
-    SpikeCV does not store rate, poses, clock, radiance gain, gaps or scored images, so they are left out. Streams whose
-    H*W is not a multiple of 8 are repacked without padding, as SpikeCV does.
+    SpikeCV does not store rate, dead ticks, poses, clock, radiance gain, gaps or scored images, so they are left out.
+    Streams whose H*W is not a multiple of 8 are repacked without padding, as SpikeCV does.
 
     Args:
         scene: Scene folder.
@@ -45,5 +45,7 @@ def export_spikecv(scene: Positional[Path], out: Path, allow_gaps: bool = False)
     spikecv.export_spikecv(opened, out)
     for camera in opened.meta["streams"]:
         print(f"{out / camera}: {opened.n_ticks} ticks of {opened.meta['width']}x{opened.meta['height']}")
-    print(f"not in SpikeCV's format: {opened.rate_hz:g} ticks per second, poses, clock, gain, scored images")
+    dead = opened.meta["sensor"].get("dead_ticks", 0)
+    facts = f"{opened.rate_hz:g} ticks per second" + (f", {dead:g} dead ticks" if dead else "")
+    print(f"not in SpikeCV's format: {facts}, poses, clock, gain, scored images")
     return 0

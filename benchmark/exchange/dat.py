@@ -1,6 +1,7 @@
 """Bare `.dat` streams, one for each camera, become a folder of streams or a scene.
 
-No header, 1 bit per pixel, row-major, least significant bit first; a tick takes ceil(width * height / 8) bytes.
+No header, 1 bit per pixel, row-major, least significant bit first; a tick takes ceil(width * height / 8) bytes. Rows of
+raw dumps may be longer than the image: those of the 400x250 camera have 416 columns.
 """
 
 from __future__ import annotations
@@ -20,21 +21,32 @@ _TICKS = 4096  # copied at a time
 
 
 def import_dat(
-    path: Path, out: Path, *, width: int, height: int, recording: Recording, cameras: Path | None = None
+    path: Path,
+    out: Path,
+    *,
+    width: int,
+    height: int,
+    recording: Recording,
+    cameras: Path | None = None,
+    row_columns: int | None = None,
 ) -> dict[str, SpikeStream]:
     """Import a bare .dat file, or a folder of them (one per camera), to a new folder; return its streams.
 
-    With `cameras` (COLMAP, OpenCV, Kalibr) it is a scene, else a folder of streams. Raises UserError before anything is
-    written where files or cameras do not fit.
+    With `cameras` (COLMAP, OpenCV, Kalibr) it is a scene, else a folder of streams. Of rows of `row_columns`, the
+    columns beyond `width` are dropped. Raises UserError before anything is written where files or cameras do not fit.
     """
     recording.check("--cameras", cameras)
     if max(width, height) > MAX_SIDE:
         raise problem("--width and --height", f"at most {MAX_SIDE}", f"{width}, {height}", "correct it")
+    stored = width if row_columns is None else row_columns
+    if row_columns is not None and (width % 8 or stored % 8 or not width <= stored <= MAX_SIDE):
+        expected = f"a multiple of 8 from --width to {MAX_SIDE}, where --width is one too"
+        raise problem("--row-columns", expected, f"{stored} of width {width}", "correct it, or leave it out")
     files = {file.stem: file for file in _dat_files(path)}
     check_ids(files, "camera", path, "rename the .dat file, after which the camera is called")
-    sources = {name: open_stream(file, width, height, recording.rate_hz) for name, file in files.items()}
+    sources = {name: open_stream(file, stored, height, recording.rate_hz) for name, file in files.items()}
     found = None if cameras is None else read_camera_files(cameras, sorted(sources), (width, height))
-    read = {name: Source(width, height, stream.n_ticks, _parts(stream)) for name, stream in sources.items()}
+    read = {name: Source(width, height, stream.n_ticks, _parts(stream, width)) for name, stream in sources.items()}
     return write_recording(out, read, found, recording, "dat")
 
 
@@ -52,5 +64,9 @@ def _dat_files(path: Path) -> list[Path]:
     return found
 
 
-def _parts(stream: SpikeStream) -> Iterator[UInt8]:
-    return (stream.packed[start : start + _TICKS] for start in range(0, stream.n_ticks, _TICKS))
+def _parts(stream: SpikeStream, width: int) -> Iterator[UInt8]:
+    for start in range(0, stream.n_ticks, _TICKS):
+        packed = stream.packed[start : start + _TICKS]
+        if width < stream.width:  # both in whole bytes
+            packed = packed.reshape(len(packed), stream.height, -1)[:, :, : width // 8].reshape(len(packed), -1)
+        yield packed

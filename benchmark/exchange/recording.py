@@ -11,7 +11,9 @@ from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import filling
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene, stream_name
+from spike4dgs.benchmark.spikes.bits import orient
 from spike4dgs.benchmark.spikes.folder import write_stream_folder
+from spike4dgs.benchmark.spikes.sensor_model import MOST_DEAD_TICKS
 from spike4dgs.benchmark.spikes.stream import SpikeStream, SpikeWriter, open_stream
 from spike4dgs.benchmark.untrusted import MAX_GAIN, MAX_HZ, check_ids
 
@@ -25,12 +27,16 @@ class Recording:
         radiance_gain: For a scene, spikes per tick of a pixel at radiance 1 (white). If it is 1, radiance is in spikes
             per tick.
         rows_top_down: The files store the top row first (these cameras usually store the bottom row first).
+        mirrored: The files store each row from right to left; the result stores it from left to right.
+        dead_ticks: Ticks after each spike in which a pixel collects no light.
         licence: Licence of the scene.
     """
 
     rate_hz: float
     radiance_gain: float = 1.0
     rows_top_down: bool = False
+    mirrored: bool = False
+    dead_ticks: float = 0.0
     licence: str = "unknown"
 
     def check(self, option: str, poses: Path | None) -> None:
@@ -38,6 +44,8 @@ class Recording:
         if not (0 < self.rate_hz <= MAX_HZ and 0 < self.radiance_gain <= MAX_GAIN):
             found = f"{self.rate_hz:g}, {self.radiance_gain:g}"
             raise problem("--rate-hz and --radiance-gain", f"positive numbers, at most {MAX_HZ:g}", found, "correct it")
+        if not 0 <= self.dead_ticks <= MOST_DEAD_TICKS:
+            raise problem("--dead-ticks", f"0 to {MOST_DEAD_TICKS}", f"{self.dead_ticks:g}", "state the sensor's")
         for name, stated in (("--licence", self.licence != "unknown"), ("--radiance-gain", self.radiance_gain != 1)):
             if stated and poses is None:
                 expected = f"{option} beside it: streams without poses state none"
@@ -85,9 +93,10 @@ def _copies(
         target = out / (f"{camera}.dat" if cameras is None else stream_name(camera))
         with SpikeWriter(target, source.width, source.height) as writer:
             for packed in source.parts:
-                writer.write(packed)
-        rate_hz, bottom_up = recording.rate_hz, not recording.rows_top_down
-        yield camera, open_stream(target, source.width, source.height, rate_hz, rows_bottom_up=bottom_up)
+                writer.write(orient(packed, source.width, source.height, False, recording.mirrored))
+        bottom_up, dead = not recording.rows_top_down, recording.dead_ticks
+        size = source.width, source.height
+        yield camera, open_stream(target, *size, recording.rate_hz, rows_bottom_up=bottom_up, dead_ticks=dead)
 
 
 def _write_scene(
@@ -108,7 +117,11 @@ def _write_scene(
             n_ticks=first.n_ticks,
             radiance_gain=recording.radiance_gain,
             targets=(),
-            sensor={"model": "unknown", "rows_bottom_up": first.rows_bottom_up},
+            sensor={
+                "model": "unknown",
+                "rows_bottom_up": first.rows_bottom_up,
+                **({"dead_ticks": first.dead_ticks} if first.dead_ticks else {}),
+            },
             source={"kind": kind},
             clock={"t0_ns": 0, "source": "unknown"},
             sync={"method": "unknown", "max_error_us": None},

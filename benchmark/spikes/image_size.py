@@ -13,8 +13,9 @@ from spike4dgs.benchmark.spikes.stream import SpikeStream, bytes_per_tick, count
 
 Size = tuple[int, int]  # width, height
 
-# Of spike cameras, then of the scenes of `make-dataset`.
-KNOWN_SIZES: tuple[Size, ...] = ((400, 250), (1000, 1000), (200, 125), (64, 40))
+# Of spike cameras, and of the raw dumps of the first, whose rows end in 16 bits of no pixel; then of the scenes of
+# `make-dataset`.
+KNOWN_SIZES: tuple[Size, ...] = ((400, 250), (416, 250), (1000, 1000), (200, 125), (64, 40))
 _TICKS = 256  # from the middle of the clip: enough to know rates, too few for most things to move far
 _MOST_ASPECT = 4.0  # of the sizes that are tried, either way
 _FEWEST = 16  # pixels of a side of such a size

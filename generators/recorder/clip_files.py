@@ -16,12 +16,12 @@ from spike4dgs.benchmark.arrays import Int64, UInt8
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import check_new, locked, writing
 from spike4dgs.benchmark.scene.writer import stream_name
+from spike4dgs.benchmark.spikes.bits import orient
 from spike4dgs.benchmark.untrusted import check_ids
 from spike4dgs.generators.recorder.clip_record import ClipRecord, write_description
 from spike4dgs.generators.recorder.disk import Buffers, DiskFile
 from spike4dgs.generators.recorder.frames.gaps import DISK, Gap, merged
 from spike4dgs.generators.recorder.frames.layouts import make_layout
-from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import TOP_DOWN, CameraProfile, RigProfile
 
 _FRAMES = 256  # unpacked at a time: 3.2 MB of 400x250, which stays in the cache

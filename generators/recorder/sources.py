@@ -12,6 +12,7 @@ from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene, Target, open_scene
 from spike4dgs.benchmark.scene.splits import Split, splits_of
+from spike4dgs.benchmark.spikes.bits import orient
 from spike4dgs.benchmark.spikes.counted_recording import raw
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.untrusted import MAX_GAIN
@@ -27,7 +28,6 @@ from spike4dgs.generators.recorder.emulation.imperfections import (
 from spike4dgs.generators.recorder.emulation.ports import emulated_ports
 from spike4dgs.generators.recorder.emulation.retiming import worse_stream
 from spike4dgs.generators.recorder.frames.layouts import PLAIN, TAGGED_ROWS, make_layout
-from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import PACKET_BYTES, PRIMARY, SECONDARY, RigProfile, load_profile
 from spike4dgs.generators.recorder.usb.ports import Port
 

@@ -17,9 +17,9 @@ from typing import Any
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.benchmark.spikes.bits import orient
 from spike4dgs.generators.recorder.emulation.camera import FAULTS, EmulatedCamera, Fault
 from spike4dgs.generators.recorder.frames.layouts import make_layout
-from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import PRIMARY, SECONDARY, CameraProfile, RigProfile
 
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spike4dgs.benchmark.arrays import UInt8
+from spike4dgs.benchmark.spikes.bits import orient
 from spike4dgs.generators.recorder.frames.gaps import OVERFLOW, SHORT_READ, STALL, TIME_OUT, UNPLUGGED
 from spike4dgs.generators.recorder.frames.layouts import make_layout
-from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.rig_profile import TOP_DOWN, CameraProfile, RigProfile
 from spike4dgs.generators.recorder.usb.reads import CANCELLED, OK
 

@@ -252,6 +252,9 @@ def test_other_lenses_are_refused(tmp_path: Path) -> None:
             fisheye = write_opencv(tmp_path / f"fisheye.{suffix}", **facts)
             with pytest.raises(UserError, match=f"found another one, with {expected:.2f} px, in cam_00"):
                 import_dat(tmp_path / "in", **STATED, cameras=fisheye, out=tmp_path / "out")
+    named = write_opencv(tmp_path / "named.yml", np.zeros(4), distortion_model="kannala_brandt4")
+    with pytest.raises(UserError, match="a distortion_model of cam_00 among plumb_bob, radtan, .*kannala_brandt4"):
+        import_dat(tmp_path / "in", **STATED, cameras=named, out=tmp_path / "out")
     five = write_opencv(tmp_path / "five.yml", np.zeros(5), fisheye_model=1)
     with pytest.raises(UserError, match="expected 4 distortion_coefficients of cam_00, found 5"):
         import_dat(tmp_path / "in", **STATED, cameras=five, out=tmp_path / "out")
@@ -352,6 +355,33 @@ def test_the_real_recording_comes_in_unchanged(tmp_path: Path) -> None:
     assert stream.counts(0, 200).mean() / 200 == pytest.approx(0.366, abs=5e-4)
 
 
+def test_the_tail_of_stored_rows_is_dropped(tmp_path: Path) -> None:
+    spikes = np.random.default_rng(2).random((5, 6, 24)) < 0.4
+    stored = np.concatenate([spikes[:, ::-1], np.ones((5, 6, 16), bool)], axis=2)
+    np.packbits(stored, bitorder="little").tofile(tmp_path / "raw.dat")
+    main_of = ["import-dat", str(tmp_path / "raw.dat"), "--width", "24", "--height", "6", "--rate-hz", "20000"]
+    assert main([*main_of, "--row-columns", "40", "--out", str(tmp_path / "out")]) == 0
+    stream = open_stream_folder(tmp_path / "out")["raw"]
+    assert (stream.width, stream.n_ticks) == (24, 5)
+    np.testing.assert_array_equal(stream.window(0, 5), spikes)
+    for wrong in (16, 41):
+        known = {"width": 24, "height": 6, "recording": Recording(2e4), "row_columns": wrong}
+        with pytest.raises(UserError, match="--row-columns: expected a multiple of 8 from --width"):
+            import_dat(tmp_path / "raw.dat", tmp_path / "other", **known)
+
+
+def test_mirrored_rows_and_dead_ticks_are_stated(tmp_path: Path) -> None:
+    spikes = write_streams(tmp_path / "in", [c.id for c in CAMERAS])["cam_00"]
+    known = Recording(20000.0, mirrored=True, dead_ticks=1.5)
+    import_dat(tmp_path / "in", **SIZE, recording=known, out=tmp_path / "streams")
+    import_dat(tmp_path / "in", **SIZE, recording=known, cameras=write_colmap(tmp_path / "m"), out=tmp_path / "scene")
+    for stream in (open_stream_folder(tmp_path / "streams")["cam_00"], open_scene(tmp_path / "scene").stream("cam_00")):
+        assert stream.dead_ticks == 1.5
+        np.testing.assert_array_equal(stream.window(0, TICKS), spikes[:, :, ::-1])
+    with pytest.raises(UserError, match="--dead-ticks: expected 0 to 10, found nan"):
+        import_dat(tmp_path / "in", **SIZE, recording=Recording(2e4, dead_ticks=float("nan")), out=tmp_path / "o")
+
+
 def test_a_models_points_rigs_and_frames_are_not_read(tmp_path: Path) -> None:
     """A count of 2^64 frames would keep pycolmap busy for years."""
     write_streams(tmp_path / "in", ["cam_00", "cam_02"])
@@ -385,6 +415,17 @@ def test_camera_matrices_of_other_conventions_are_refused(tmp_path: Path, wrong:
     path = write_opencv(tmp_path / "cameras.yml", camera_matrix=wrong)
     with pytest.raises(UserError, match=r"expected a 3x3 matrix \(fx, 0, cx; 0, fy, cy; 0, 0, 1\) .* for cam_00"):
         import_dat(tmp_path / "in", **STATED, cameras=path, out=tmp_path / "out")
+
+
+def test_a_matrix_of_ros_states_no_type(tmp_path: Path) -> None:
+    values = {"camera_matrix": CAMERAS[0].K, "distortion_coefficients": np.zeros((1, 5)), "R": np.eye(3)}
+    node: dict[str, Any] = {
+        name: {"rows": m.shape[0], "cols": m.shape[1], "data": m.ravel().tolist()} for name, m in values.items()
+    }
+    (tmp_path / "left.yaml").write_text(yaml.safe_dump(node | {"T": [0.0, 0.0, 0.0], "distortion_model": "plumb_bob"}))
+    write_streams(tmp_path / "in", ["left"])
+    import_dat(tmp_path / "in", **STATED, cameras=tmp_path / "left.yaml", out=tmp_path / "out")
+    assert open_scene(tmp_path / "out").cameras["left"].fx == CAMERAS[0].fx
 
 
 @pytest.mark.parametrize("facts", ["rows: 3, dt: d", "rows: 3, cols: 900000000, dt: d", "rows: 3, cols: 3, dt: 3d"])

@@ -1,12 +1,14 @@
 """SpikeCV folders: round trips, the layout at sizes that are no whole bytes, and refused folders."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from changes import edit_json
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import HEIGHT, TICKS, WIDTH, array_cameras
@@ -15,6 +17,7 @@ from spike4dgs.benchmark import UserError, open_scene
 from spike4dgs.benchmark.exchange.recording import Recording
 from spike4dgs.benchmark.exchange.spikecv import export_spikecv, import_spikecv
 from spike4dgs.benchmark.scene.cameras import to_nerfstudio
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.spikes.folder import open_stream_folder
 from spike4dgs.benchmark.spikes.stream import pack
 from spike4dgs.cli import main
@@ -66,6 +69,18 @@ def test_a_scene_goes_out_and_comes_back(small_scene: Path, tmp_path: Path, caps
         assert (small_scene / name).read_bytes() == (tmp_path / "back" / name).read_bytes()
         np.testing.assert_allclose(back.cameras[camera].w2c, scene.cameras[camera].w2c, atol=1e-12)
     assert len(back.training.streams) == 4
+
+
+def test_dead_ticks_are_told_of_and_can_be_stated_again(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = Path(shutil.copytree(small_scene, tmp_path / "dead"))
+    edit_json(scene / "scene.json", lambda facts: facts["sensor"].update(dead_ticks=1.5))
+    write_manifest(scene)
+    assert main(["export-spikecv", str(scene), "--out", str(tmp_path / "cv")]) == 0
+    assert "20000 ticks per second, 1.5 dead ticks, poses" in capsys.readouterr().out
+    import_spikecv(tmp_path / "cv", tmp_path / "back", Recording(20000.0, dead_ticks=1.5))
+    assert open_stream_folder(tmp_path / "back")["cam_00"].dead_ticks == 1.5
 
 
 @settings(max_examples=12, deadline=None)

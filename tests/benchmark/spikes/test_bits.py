@@ -59,3 +59,14 @@ def test_scalars_arrays_and_compiled_code_agree(function, cases):
     assert [function(*row) for row in zip(*arguments, strict=True)] == expected.tolist()
     compiled = bits.kernel(function)
     assert [compiled(*row) for row in zip(*arguments, strict=True)] == expected.tolist()
+
+
+@pytest.mark.parametrize(("width", "height"), [(16, 4), (13, 5), (8, 1), (1, 9), (400, 250)])
+@pytest.mark.parametrize(("flip", "mirror"), [(False, False), (True, False), (False, True), (True, True)])
+def test_orientation_equals_that_of_unpacked_images(width: int, height: int, flip: bool, mirror: bool) -> None:
+    spikes = np.random.default_rng(0).random((2, height * width)) < 0.4
+    packed = np.packbits(spikes, axis=1, bitorder="little")
+    images = np.unpackbits(packed, axis=1, count=width * height, bitorder="little").reshape(-1, height, width)
+    images = images[:, :: -1 if flip else 1, :: -1 if mirror else 1]
+    expected = np.packbits(images.reshape(2, -1), axis=1, bitorder="little")
+    np.testing.assert_array_equal(bits.orient(packed, width, height, flip, mirror), expected)

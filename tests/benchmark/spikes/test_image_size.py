@@ -56,6 +56,14 @@ def test_noise_even_light_and_rows_that_differ_in_turn_raise_no_doubt(seed: int)
     assert size_doubt(stream(rng.random((100, 1, 96)) < 0.3)) is None
 
 
+def test_rows_of_416_columns_are_noticed() -> None:
+    """As many frames as make whole ticks of 400x250 too."""
+    raw = np.concatenate([scene(400, 250, ticks=25), np.random.default_rng(1).random((25, 250, 16)) < 0.5], axis=2)
+    assert str(size_doubt(SpikeStream(pack(raw).reshape(-1, 12_500), 400, 250, 2e4))).endswith(
+        "try --width 416 --height 250"
+    )
+
+
 def test_a_real_recording_is_known_by_its_rows() -> None:
     data = np.fromfile(shared_file("data/real_spikes/car_100kmh_250x400_200f.dat"), np.uint8)
     assert fitting_sizes(data)[0] == (400, 250) and row_agreement(data, (400, 250)) > 0.99

@@ -15,11 +15,11 @@ from recorder_rig import FRAME, HEIGHT, WIDTH, source_scene
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.scene.scene import Scene
+from spike4dgs.benchmark.spikes.bits import orient
 from spike4dgs.generators.recorder.emulation import camera as emulated_camera
 from spike4dgs.generators.recorder.emulation.array import EmulatedArray, scene_streams
 from spike4dgs.generators.recorder.emulation.camera import EmulatedCamera, Fault
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, make_layout
-from spike4dgs.generators.recorder.frames.orientation import orient
 
 
 @pytest.fixture(scope="module")

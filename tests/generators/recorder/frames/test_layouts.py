@@ -8,7 +8,6 @@ import pytest
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.generators.recorder.frames.gaps import Gap
 from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, Layout, make_layout
-from spike4dgs.generators.recorder.frames.orientation import orient
 from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 
 SIZES = {"plain": (400, 250), "padded-rows": (400, 250), "tagged-rows": (400, 250), "line-tagged": (1000, 1000)}
@@ -111,16 +110,6 @@ def test_a_frame_of_two_parts_is_torn_wherever_they_meet_after_its_first_row(dis
     b = layout.pack(packed_ticks(400, 250, 1, seed=1), 900 + distance)[0]
     for cut in [52, 103, 104, 6_000, 12_896, 12_947, 12_948, 12_998]:
         assert layout.counts(np.concatenate([a[:cut], b[cut:]])[None]).tolist() == [-1]
-
-
-@pytest.mark.parametrize(("width", "height"), [(16, 4), (13, 5), (8, 1), (1, 9), (400, 250)])
-@pytest.mark.parametrize(("flip", "mirror"), [(False, False), (True, False), (False, True), (True, True)])
-def test_orientation_equals_that_of_unpacked_images(width: int, height: int, flip: bool, mirror: bool) -> None:
-    packed = packed_ticks(width, height, 2)
-    images = np.unpackbits(packed, axis=1, count=width * height, bitorder="little").reshape(-1, height, width)
-    images = images[:, :: -1 if flip else 1, :: -1 if mirror else 1]
-    expected = np.packbits(images.reshape(2, -1), axis=1, bitorder="little")
-    np.testing.assert_array_equal(orient(packed, width, height, flip, mirror), expected)
 
 
 # ---------------------------------------------------------------- ticks
