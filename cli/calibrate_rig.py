@@ -80,6 +80,7 @@ def calibrate_rig(
         write_json(out / "report.json", report)
         _plot(recordings, seen, found, out / "corners.png")
     _print(report)
+    print("an array of mirrored images calibrates as well: text in front of a camera must be readable in `inspect`")
     print(f"calibration, report and image: {out}")
     return 0
 

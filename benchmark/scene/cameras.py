@@ -190,12 +190,12 @@ def distortion_px(camera: Camera, other_lens: Callable[[Float64], Float64] | Non
     return float(moved.max()) if np.isfinite(moved).all() else float("inf")
 
 
-def check_lens(camera: Camera, where: str | Path) -> None:
+def check_lens(camera: Camera, where: str | Path, fix: str = "calibrate with fewer coefficients") -> None:
     """Raise UserError unless the lens's model gives a ray for every pixel."""
     if camera.distortion and not np.isfinite(camera.normalized(border(camera))).all():
         values = ", ".join(f"{name} {value:g}" for name, value in zip(NAMES, camera.distortion, strict=True))
         expected = f"a lens of {camera.id} whose model holds up to the image's corners"
-        raise problem(where, expected, values, "calibrate with fewer coefficients")
+        raise problem(where, expected, values, fix)
 
 
 def check_rotation(R: Float64, where: str) -> None:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.metrics.pose_error import Sim3, align_cameras, pose_errors
-from spike4dgs.benchmark.scene.cameras import Camera, array_axes
+from spike4dgs.benchmark.scene.cameras import Camera, array_axes, check_lens
 from spike4dgs.benchmark.scene.lens import make_distortion
 from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
@@ -25,6 +27,8 @@ from spike4dgs.generators.recorder.rig_calibration.initial_rig import estimate_r
 
 WORST_PX, MOST_LEFT_OUT = 1.0, 0.25  # limits of reprojection error and of rejected corners; beyond, the fit has failed
 WORST_FOCAL = 0.03  # limit of a focal length's standard deviation; a well tilted board leaves 0.005 at most
+WORST_LENS_PX = 1.0  # limit of the standard deviation of what a lens does to the image's corners
+_REACH = "move the board into the corners of all images, or leave --distortion out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +54,7 @@ def calibrate_array(
     """Return intrinsics and poses from detections; corners that do not fit are left out. `size`: width, height.
 
     Raises UserError where a camera has too few detections, where no array of pinholes explains them, or where they
-    leave a focal length open.
+    leave a focal length or a lens open.
     """
     points = board.corners
     initial, reference = estimate_rig(detections, points, names, size)
@@ -78,7 +82,22 @@ def calibrate_array(
         expected = f"focal lengths to {WORST_FOCAL:.0%}, one standard deviation"
         fix = "tilt the board to all sides by 20 to 40 degrees, or add --shared-focal or --centered if that is so"
         raise problem("array", expected, f"{unknown.max():.1%} for {names[int(unknown.argmax())]}", fix)
-    return ArrayCalibration(levelled(found.rig, names, size), found, used, reference, error, each)
+    cameras = levelled(found.rig, names, size)
+    if found.lens is not None:
+        _check_lenses(cameras, found.lens)
+    return ArrayCalibration(cameras, found, used, reference, error, each)
+
+
+def _check_lenses(cameras: Sequence[Camera], covariances: Float64) -> None:
+    """Raise UserError where a lens folds within the image, or covariances [C, 2, 2] of k1 and k2 leave it open."""
+    for camera, covariance in zip(cameras, covariances, strict=True):
+        x, y = (max(at, side - at) for at, side in ((camera.cx, camera.width), (camera.cy, camera.height)))
+        radius = math.hypot(x, y) / camera.fx
+        powers = camera.fx * np.array([radius**3, radius**5])
+        if not (sd := math.sqrt(powers @ covariance @ powers)) < WORST_LENS_PX:
+            expected = f"lenses to {WORST_LENS_PX:g} px in the corners of the image, one standard deviation"
+            raise problem("array", expected, f"{sd:.1f} px for {camera.id}", _REACH)
+        check_lens(camera, "array", _REACH)
 
 
 def levelled(rig: Rig, names: Sequence[str], size: tuple[int, int]) -> tuple[Camera, ...]:

@@ -97,6 +97,7 @@ class Adjusted:
     center_m: Float64  # [C] of a camera's centre, root of the sum over its axes
     turn_deg: Float64  # [C] of its rotation, likewise
     focal_px: Float64  # [C]
+    lens: Float64 | None = None  # [C, 2, 2] covariance of k1 and k2; None: pinholes
 
 
 def adjust(
@@ -126,7 +127,10 @@ def adjust(
         if converged:
             break
     variance = max(cost / max(2 * int(detections.used.sum()) - columns.n, 1), _FINEST_PX**2)
-    return Adjusted(rig, math.sqrt(variance), *_deviations(variance * _diagonal_of_inverse(H), columns))
+    covariance = variance * _inverse(H)
+    own = columns.camera[:, _PER_CAMERA:]
+    lens = covariance[own[:, :, None], own[:, None]] if freedom.distortion else None
+    return Adjusted(rig, math.sqrt(variance), *_deviations(np.diag(covariance), columns), lens)
 
 
 def trimmed(rig: Rig, detections: Detections, points: Float64, sigmas: float = 4.0) -> Detections:
@@ -231,15 +235,16 @@ def _nudged(R: Float64, t: Float64, motion: Float64) -> tuple[Float64, Float64]:
     return turn @ R, np.einsum("nij,nj->ni", turn, t) + motion[:, 3:]
 
 
-def _diagonal_of_inverse(H: Float64) -> Float64:
-    """Return the diagonal [P] of the inverse of a normal matrix: very large where the data determine nothing.
+def _inverse(H: Float64) -> Float64:
+    """Return the inverse [P, P] of a normal matrix: very large where the data determine nothing.
 
     Its units differ, metres from pixels by orders of magnitude, so its eigenvalues compare only at a unit diagonal.
     """
     own = np.diag(H)
     scale = 1 / np.sqrt(np.where(own > 0, own, 1.0))
     values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    return np.asarray(scale**2 * (vectors**2 @ (1 / np.maximum(values, np.finfo(float).eps))), np.float64)
+    unit = (vectors / np.maximum(values, np.finfo(float).eps)) @ vectors.T
+    return np.asarray(unit * np.outer(scale, scale), np.float64)
 
 
 def _deviations(variances: Float64, columns: _Columns) -> tuple[Float64, Float64, Float64]:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import pose_errors
 from spike4dgs.generators.recorder.rig_calibration import array_calibration
+from spike4dgs.generators.recorder.rig_calibration.board import Board
 from spike4dgs.generators.recorder.rig_calibration.bundle_adjustment import (
     Detections,
     Freedom,
@@ -106,6 +107,9 @@ def test_lenses_are_estimated_as_scipy_would_and_only_on_request():
     found = adjust(rig, detections, BOARD.corners, reference, Freedom(distortion=True))
     assert pinholes.rig.lens is None and pinholes.sigma_px > 1.5 * found.sigma_px
     assert 0.045 < found.sigma_px < 0.055  # the noise that was added
+    assert pinholes.lens is None
+    off = found.rig.lens - lens[:2]
+    assert max(k @ np.linalg.solve(covariance, k) for k, covariance in zip(off, found.lens, strict=True)) < 16
     n, at = len(cameras), found.rig
 
     def residuals(x):
@@ -123,6 +127,26 @@ def test_lenses_are_estimated_as_scipy_would_and_only_on_request():
         rays = camera.normalized(corners) - camera.normalized(corners[-1:])
         expected = true.normalized(corners) - true.normalized(corners[-1:])
         assert np.abs(rays - expected).max() * true.fx < 0.5  # px; the board does not reach the corners
+
+
+def test_lenses_that_the_corners_leave_open_are_refused(monkeypatch):
+    """A small board in the middle of the images fits well with lenses of any kind."""
+    rng, board, base = np.random.default_rng(1), Board(8, 5, 0.01), np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]])
+    cameras, rows = CAMERAS[::3], []
+    for v in range(10):
+        tilt = rng.uniform([-35, -35, -20], [35, 35, 20])
+        turn = Rotation.from_euler("xyz", tilt, degrees=True).as_matrix()
+        points = board.corners @ (turn @ base).T + rng.uniform(-0.01, 0.01, 3)
+        rows += [(c, v, camera.project(points)[0]) for c, camera in enumerate(cameras)]
+    camera, view, uv = (np.array([row[k] for row in rows]) for k in range(3))
+    seen = Detections(camera, view, uv + 0.01 * rng.normal(size=uv.shape), np.ones(uv.shape[:2], bool))
+    arguments = seen, board, [c.id for c in cameras], (WIDTH, HEIGHT), Freedom(distortion=True)
+    fix = "move the board into the corners of all images, or leave --distortion out"
+    with pytest.raises(UserError, match=f"expected lenses to 1 px in the corners .* one standard deviation.*; {fix}"):
+        array_calibration.calibrate_array(*arguments)
+    monkeypatch.setattr(array_calibration, "WORST_LENS_PX", np.inf)
+    with pytest.raises(UserError, match=f"a lens of cam_0. whose model holds up to the image's corners.*; {fix}"):
+        array_calibration.calibrate_array(*arguments)
 
 
 def test_fixed_parameters_stay(adjusted):
