@@ -204,7 +204,7 @@ class _Line:
 def _theil_sen(arrival: NDArray[np.float64]) -> _Line:
     """Return the median of all slopes between two of the points (tick, ns) [m, 2], and the median height."""
     if len(arrival) < 3 or np.ptp(arrival[:, 0]) == 0:
-        return _Line(*[math.nan] * 6, len(arrival))
+        return _Line(math.nan, math.nan, math.nan, math.nan, math.nan, math.nan, len(arrival))
     used = arrival[np.linspace(0, len(arrival) - 1, min(len(arrival), _MOST_READS)).astype(int)]
     base = used[0, 1]  # CLOCK_MONOTONIC in ns needs more digits than the differences
     x, y = used[:, 0], used[:, 1] - base

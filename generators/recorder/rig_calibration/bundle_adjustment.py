@@ -128,8 +128,8 @@ def adjust(
             break
     variance = max(cost / max(2 * int(detections.used.sum()) - columns.n, 1), _FINEST_PX**2)
     covariance = variance * _inverse(H)
-    own = columns.camera[:, _PER_CAMERA:]
-    lens = covariance[own[:, :, None], own[:, None]] if freedom.distortion else None
+    at = columns.camera[:, _PER_CAMERA:]
+    lens = covariance[at[:, :, None], at[:, None]] if freedom.distortion else None
     return Adjusted(rig, math.sqrt(variance), *_deviations(np.diag(covariance), columns), lens)
 
 
