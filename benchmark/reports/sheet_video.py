@@ -80,7 +80,7 @@ def write_sheet_video(path: Path, scene: Scene, folders: Mapping[str, Path], rec
     panels = make_panels(scene, folders, records)
     layout = make_layout(panels)
     ground = _ground(panels, layout)
-    with video_writer(path, layout.size, FPS) as write:
+    with video_writer(path, layout.size, FPS, gray=False) as write:
         for k in range(len(panels.targets)):
             write(_frame(panels, layout, ground, k))
 

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
@@ -15,6 +13,8 @@ from spike4dgs.benchmark.files import atomic_path
 # By suffix: codecs in order of preference. MPEG-4 part 2 is for builds of OpenCV without libvpx: players show it,
 # browsers do not. Motion JPEG opens everywhere and is several times larger.
 CODECS = {".mp4": ("vp09", "mp4v"), ".avi": ("MJPG",)}
+# OpenCV rounds a colour's chroma down; with this much more blue and red (BGR) a gray of a colour frame stays gray.
+NEUTRAL = (2, 0, 1, 0)
 Write = Callable[[UInt8], None]
 
 
@@ -25,11 +25,11 @@ def check_video(path: Path) -> None:
 
 
 @contextmanager
-def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
-    """Yield a function that writes a frame, gray [H, W] or RGB [H, W, 3]; the file appears when all are written.
+def video_writer(path: Path, size: tuple[int, int], fps: float, *, gray: bool) -> Iterator[Write]:
+    """Yield a function that writes a frame; the file appears when all are written.
 
-    `size` is (width, height), both even. Raises UserError for another suffix, where no codec works, and for frames of
-    another size.
+    Frames are [H, W] in a `gray` video, which keeps their values, and else RGB [H, W, 3]. `size` is (width, height),
+    both even. Raises UserError for another suffix, where no codec works, and for frames of another size.
     """
     import cv2
 
@@ -37,7 +37,7 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Writ
     with atomic_path(path) as part:
         part.touch()  # OpenCV does not say why it cannot write
         for codec in CODECS[path.suffix]:
-            writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
+            writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size, isColor=not gray)
             if writer.isOpened():
                 break
         else:
@@ -51,8 +51,7 @@ def video_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Writ
             count += 1
             if frame.shape[:2] != size[::-1]:
                 raise problem(path, f"frames of {size[0]}x{size[1]}", f"{frame.shape}", "render all at one size")
-            gray = frame.ndim == 2
-            writer.write(np.repeat(frame[:, :, None], 3, 2) if gray else np.ascontiguousarray(frame[:, :, ::-1]))
+            writer.write(frame if gray else cv2.add(frame[:, :, ::-1], NEUTRAL))
 
         try:
             yield write

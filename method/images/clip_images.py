@@ -106,7 +106,7 @@ def write_clip_images(out: Path, wanted: ClipImages) -> bool:
     wanted = replace(wanted, stream=s)
     wanted.maker(s, ticks[:1], wanted.gain)  # a maker that lacks something says so before anything is written
     write_json(folder / _NAME, {**facts, "complete": False})
-    with video_writer(video, (s.width + s.width % 2, s.height + s.height % 2), wanted.fps) as write:
+    with video_writer(video, (s.width + s.width % 2, s.height + s.height % 2), wanted.fps, gray=True) as write:
         title = f"{wanted.camera}: {wanted.maker.name}"
         for tick in _shown(ticks, title):
             image = _image(folder, wanted, tick)

@@ -202,7 +202,7 @@ def _write_video(path: Path, saved: SavedModel) -> float:
     start = time.perf_counter()
     saved.model.render(first, 0.0)
     fps = FPS if time.perf_counter() - start < SLOW_FRAME_S else SLOW_FPS
-    with video_writer(path, (first.width, first.height), fps) as write:
+    with video_writer(path, (first.width, first.height), fps, gray=True) as write:
         for image in render_frames(saved, view, frame_times(about.duration_us, slow_motion, fps), SCALE):
             write(image)
     return slow_motion

@@ -71,7 +71,7 @@ def render_video(
     with ExitStack() as stack:
         writers: list[Write] = []
         if out is not None:
-            writers.append(stack.enter_context(video_writer(out, size, fps)))
+            writers.append(stack.enter_context(video_writer(out, size, fps, gray=True)))
         if frames is not None:
             writers.append(png_writer(frames, len(times)))
         for image in _shown(render_frames(saved, path, times, playback.scale), len(times), saved.title):

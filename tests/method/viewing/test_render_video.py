@@ -164,10 +164,22 @@ def test_frames_sort_by_name(tmp_path: Path, count: int, first: str) -> None:
 def test_colours_survive_the_video(tmp_path: Path) -> None:
     frame = np.zeros((32, 48, 3), np.uint8)
     frame[..., 0] = 200  # red
-    with video_writer(tmp_path / "v.avi", (48, 32), 10) as write:
+    with video_writer(tmp_path / "v.avi", (48, 32), 10, gray=False) as write:
         write(frame)
     ok, found = cv2.VideoCapture(str(tmp_path / "v.avi")).read()
     assert ok and np.abs(found[:, :, ::-1].astype(int) - frame).mean() < 4
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
+@pytest.mark.parametrize("gray", [True, False])
+def test_a_gray_comes_back_as_it_went_in(tmp_path: Path, suffix: str, gray: bool) -> None:
+    ramp = np.arange(1, 250, 8, np.uint8).repeat(16)[None].repeat(32, 0)
+    path = tmp_path / f"v{suffix}"
+    with video_writer(path, (ramp.shape[1], 32), 10, gray=gray) as write:
+        write(ramp if gray else ramp[:, :, None].repeat(3, 2))
+    found = cv2.VideoCapture(str(path)).read()[1][16, 8::16].astype(int)
+    assert np.ptp(found, axis=1).max() <= 1, "no tint"
+    assert np.abs(found - ramp[0, 8::16, None]).max() <= 2
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".avi"])
@@ -178,7 +190,7 @@ def test_a_video_that_a_disk_has_no_room_for_is_an_error(tmp_path: Path, suffix:
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, old[1]))
     try:
         with pytest.raises(UserError, match="a video with its last frame, found a broken one after 30 frames"):
-            with video_writer(path, (128, 96), 30.0) as write:
+            with video_writer(path, (128, 96), 30.0, gray=True) as write:
                 for image in images:
                     write(image)
     finally:
@@ -188,7 +200,7 @@ def test_a_video_that_a_disk_has_no_room_for_is_an_error(tmp_path: Path, suffix:
 
 def test_a_failure_leaves_no_video(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"expected frames of 48x32, found \(30, 48\)"):
-        with video_writer(tmp_path / "v.avi", (48, 32), 10) as write:
+        with video_writer(tmp_path / "v.avi", (48, 32), 10, gray=True) as write:
             write(np.zeros((32, 48), np.uint8))
             write(np.zeros((30, 48), np.uint8))
     assert not list(tmp_path.iterdir())
@@ -227,6 +239,6 @@ def test_speed_render_puts_models_side_by_side(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_where_no_video_can_be_written_the_system_says_why() -> None:
-    with pytest.raises(UserError) as told, video_writer(Path("/proc/v.avi"), (48, 32), 10):
+    with pytest.raises(UserError) as told, video_writer(Path("/proc/v.avi"), (48, 32), 10, gray=True):
         pass
     assert "/proc/v.avi" in str(told.value) and "encoder" not in str(told.value)
