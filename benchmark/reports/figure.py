@@ -44,10 +44,10 @@ def save_with_pdf(figure: Figure, path: Path) -> None:
 
 
 def method_color(i: int) -> Any:
-    """Return the colour of the i-th method."""
+    """Return the colour of the i-th method: 60 differ."""
     from matplotlib import colormaps
 
-    return colormaps["tab20"](i % 20)
+    return colormaps[("tab20", "tab20b", "tab20c")[i // 20 % 3]](i % 20)
 
 
 def wrap_name(name: str, width: int) -> list[str]:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.transforms import Bbox
 
 SHOWN = ("psnr", "psnr_dynamic")
+MARKERS = "osD^vP*X<>hpd8"  # of scenes
 LEAST_SECONDS = 1e-3  # a logarithm needs more than zero
 CROWD = 30  # markers of scenes; more of them are paler
 FAR = 0.75  # a gap of so much of the range of those above it makes those below it a floor...
@@ -55,7 +56,7 @@ class Point:
 def write_scatter(path: Path, records: Sequence[Record]) -> None:
     """Write a PNG and a PDF: PSNR of the whole image and of the moving region against fit time.
 
-    A colour is a method: a named dot is its mean over scenes, small markers are the scenes. A floor, methods far below
+    A colour is a method: a named ring is its mean over scenes, small markers are the scenes. A floor, methods far below
     all others, does not stretch the axes: it is on the edge, with an arrow and its values.
     """
     save_with_pdf(make_scatter(records), path)
@@ -64,17 +65,16 @@ def write_scatter(path: Path, records: Sequence[Record]) -> None:
 def make_scatter(records: Sequence[Record]) -> Figure:
     """Return the scatter as a figure."""
     figure = new_figure((11, 4.6), None, dpi=160)
-    markers = dict(
-        zip(dict.fromkeys(s for r in records for s in r["scenes"]), itertools.cycle("osD^vP*X"), strict=False)
-    )
+    markers = dict(zip(dict.fromkeys(s for r in records for s in r["scenes"]), itertools.cycle(MARKERS), strict=False))
+    names = [*markers, "mean over scenes"]
+    columns = max(1, min(len(names), int(150 / max(len(name) + 6 for name in names))))
+    bottom = max(0.2, 0.13 + 0.035 * math.ceil(len(names) / columns))
     for n, metric in enumerate(SHOWN):
-        axes = figure.add_axes((0.06 + 0.5 * n, 0.2, 0.425, 0.77))
+        axes = figure.add_axes((0.06 + 0.5 * n, bottom, 0.425, 0.97 - bottom))
         _panel(axes, metric, points_of(records, metric), markers)
     if len(markers) > 1:
         keys = [figure.axes[0].plot([], [], marker, color="0.45", ms=4, ls="")[0] for marker in markers.values()]
-        keys.append(figure.axes[0].plot([], [], "o", color="0.45", ms=8, ls="")[0])
-        names = [*markers, "mean over scenes"]
-        columns = max(1, min(len(names), int(150 / max(len(name) + 6 for name in names))))
+        keys.append(_ring(figure.axes[0], [], [], "0.45"))
         figure.legend(keys, names, loc="lower center", ncols=columns, fontsize=7.5, frameon=False)
     return figure
 
@@ -128,14 +128,19 @@ def _panel(axes: Axes, metric: str, points: Sequence[Point], markers: Mapping[st
     for point in inside:
         for scene, (x, y) in point.scenes.items():
             axes.plot(x, y, markers[scene], color=point.color, ms=4, alpha=strength, mew=0)
-        axes.plot(point.x, point.y, "o", color=point.color, ms=9, mec="white", mew=0.7)
+        _ring(axes, point.x, point.y, point.color)
     labels, tips = [(p.x, p.y, p.label) for p in inside], []
     for point in far:
         place, tip = _arrow(axes, point)
         labels.append((*place, _far_label(point, metric)))
-        axes.plot(*place, "o", color=point.color, ms=6, mec="white", mew=0.7, clip_on=False)
+        _ring(axes, *place, point.color, clip_on=False)
         tips.append(tip)
     label_points(axes, labels, [*(xy for p in inside for xy in p.scenes.values()), *tips])
+
+
+def _ring(axes: Axes, x: Any, y: Any, color: Any, **style: Any) -> Any:
+    """Draw the mark of a mean."""
+    return axes.plot(x, y, "o", ms=8, mfc="none", mec=color, mew=2.2, ls="", **style)[0]
 
 
 def _limits(axes: Axes, inside: Sequence[Point], timed: Sequence[Point], room: bool) -> None:
@@ -143,8 +148,9 @@ def _limits(axes: Axes, inside: Sequence[Point], timed: Sequence[Point], room: b
     xs = [x for p in inside for x, _ in p.scenes.values()] + [p.x for p in timed]
     ys = [y for p in inside for _, y in p.scenes.values()]
     wide, high = max(max(xs) / min(xs), 1.5), max(max(ys) - min(ys), 1.0)
+    lack = (high - (max(ys) - min(ys))) / 2
     axes.set_xlim(min(xs) / wide**0.13, max(xs) * wide**0.13)
-    axes.set_ylim(min(ys) - (0.22 if room else 0.08) * high, max(ys) + 0.1 * high)
+    axes.set_ylim(min(ys) - lack - (0.22 if room else 0.08) * high, max(ys) + lack + 0.1 * high)
     ticks = log_ticks(*axes.get_xlim())
     axes.set_xticks(ticks, labels=[f"{t:g}" for t in ticks])
     axes.set_xticks([], minor=True)
@@ -161,7 +167,7 @@ def _arrow(axes: Axes, point: Point) -> list[tuple[float, float]]:
 
 
 def _far_label(point: Point, metric: str) -> str:
-    seconds = f"{point.x:.3g}" if point.x > LEAST_SECONDS else f"<{LEAST_SECONDS:g}"
+    seconds = f"{point.x:.3g}" if point.x > LEAST_SECONDS * (1 + 1e-9) else f"<{LEAST_SECONDS:g}"
     return f"{point.label}: {METRICS[metric].format(point.y)} {METRICS[metric].unit}, {seconds} s"
 
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from pypdf import PdfReader
 
+from spike4dgs.benchmark.reports.figure import method_color
 from spike4dgs.benchmark.reports.scatter import floor_of, make_scatter, write_scatter
 
 GOOD = {"tfi+4dgs": (31.5, 100), "tfp+4dgs": (33.7, 96), "spike4dgs": (36.3, 115), "spike4dgs-x": (40.3, 81)}
@@ -72,6 +73,32 @@ def test_the_floor_is_on_the_edge_with_its_values_and_does_not_set_the_axes() ->
         arrows = [t for t in axes.texts if isinstance(t, Annotation) and t.arrow_patch and not t.get_text()]
         directions = [np.subtract(t.xy, t.get_position()) for t in arrows if t.xycoords == "axes fraction"]
         assert [tuple(np.sign(d)) for d in directions] == [(-1, -1), (0, -1)], "left and down, and down"
+
+
+def test_one_dot_has_an_axis_of_a_decibel_whose_name_is_inside() -> None:
+    figure = make_scatter([record("a", {"s": (31.2, 60)})])
+    figure.canvas.draw()
+    for axes, middle in zip(figure.axes, (31.2, 26.2), strict=True):
+        low, high = axes.get_ylim()
+        assert 1 < high - low < 1.3 and np.mean((low, high)) == pytest.approx(middle, abs=0.05)
+        assert axes.yaxis.label.get_window_extent().x0 > 0
+
+
+def test_a_time_of_nothing_is_below_the_least(tmp_path: Path) -> None:
+    none = record("nearest-view", {"a": (15.0, 0.0), "b": (16.0, 0.0)})
+    assert "nearest-view: 15.50 dB, <0.001 s" in labels(make_scatter([none, *records(GOOD)]).axes[0])
+
+
+def test_each_scene_has_its_marker_and_each_method_its_colour() -> None:
+    scenes = {f"scene {i} of many": (30.0 + i, 60.0) for i in range(14)}
+    figure = make_scatter([record("a", scenes)])
+    keys = figure.legends[0].legend_handles
+    marks = {(key.get_marker(), key.get_markerfacecolor()) for key in keys}
+    assert len(marks) == len(keys) == 15, "the mean's differs from all"
+    figure.canvas.draw()
+    legend = figure.legends[0].get_window_extent()
+    assert not legend.overlaps(figure.axes[0].xaxis.label.get_window_extent())
+    assert len({method_color(i) for i in range(60)}) > 50 and method_color(20) != method_color(0)
 
 
 def test_methods_that_are_close_have_no_floor() -> None:
