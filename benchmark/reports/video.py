@@ -37,7 +37,8 @@ def video_writer(path: Path, size: tuple[int, int], fps: float, *, gray: bool) -
     with atomic_path(path) as part:
         part.touch()  # OpenCV does not say why it cannot write
         for codec in CODECS[path.suffix]:
-            writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size, isColor=not gray)
+            fourcc = cv2.VideoWriter.fourcc(*codec)
+            writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, fourcc, fps, size, isColor=not gray)
             if writer.isOpened():
                 break
         else:

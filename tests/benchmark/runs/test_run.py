@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -23,10 +24,11 @@ from small_scenes import write_small_scene
 from spike4dgs.benchmark import Budget, FitRequest, TrainingScene, UserError, get_method, open_scene
 from spike4dgs.benchmark import method as recipes
 from spike4dgs.benchmark.runs import cell
-from spike4dgs.benchmark.runs.cell import FitClock, Job
+from spike4dgs.benchmark.runs.cell import FitClock, Job, render_targets
 from spike4dgs.benchmark.runs.method_code import code_of
 from spike4dgs.benchmark.runs.record import check_record, of_scenes
 from spike4dgs.benchmark.runs.run import Settings, run_matrix
+from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import read_exr, write_exr, write_mask
 from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.weights import WeightsError
@@ -171,6 +173,21 @@ def test_a_method_is_warmed_up_before_the_clock_of_its_fit(small_scene: Path, tm
     assert record["scenes"]["pattern-0"]["status"] == "ok" and method.clocks == [0, 1]
     (plain,) = run(tmp_path / "plain", [small_scene], CountMethod(), seed=3)
     assert plain["mean"] == record["mean"]
+
+
+def test_what_the_first_rendering_loads_is_not_in_the_images_a_second(small_scene: Path) -> None:
+    loaded: list[float] = []
+
+    class Loading:
+        def render(self, camera: Camera, t_us: float) -> Any:
+            time.sleep(0 if loaded else 0.5)
+            loaded.append(t_us)
+            return np.full((camera.height, camera.width), len(loaded), np.float32)
+
+    scene, added = open_scene(small_scene), []
+    costs = render_targets(Loading(), scene, scene.cameras, "m", "cpu", lambda *found: added.append(found))
+    assert [target for target, _, _ in added] == list(scene.targets) and len(loaded) == len(added) + 1
+    assert (costs["render_fps"] or 0) > len(added) / 0.4
 
 
 def test_whatever_changes_the_result_changes_the_key(tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ def test_other_splits_hold_out_their_own_cameras(tmp_path: Path) -> None:
 def test_refined_views_are_sent_after_the_images_are_taken(small_scene: Path, tmp_path: Path) -> None:
     plain, refined = run(tmp_path / "out", [small_scene], Refines(tmp_path / "seen.json"), seed=3, **APART)
     seen = json.loads((tmp_path / "seen.json").read_text())
-    assert seen["before"] == 3 and seen["image"] > 0 and 0 < seen["background"] < 40 * 24
+    assert seen["before"] == 1 + 3 and seen["image"] > 0 and 0 < seen["background"] < 40 * 24
     assert [plain["method"]["name"], refined["method"]["name"]] == ["refines", "refines.refined"]
     here = run(tmp_path / "here", [small_scene], Refines(tmp_path / "here.json"), seed=3, **PSNR)
     assert [r["mean"] for r in here] == [plain["mean"], refined["mean"]] and plain["mean"] != refined["mean"]
