@@ -82,7 +82,7 @@ def _card(root: Path) -> Iterator[str]:
 
 
 def _croissant(root: Path) -> Iterator[str]:
-    """Croissant is checked by mlcroissant where it is installed, else only for being JSON."""
+    """Croissant is checked by mlcroissant where it is installed, else only for being JSON, which is then said."""
     path = root / croissant.NAME
     if not path.is_file():
         return
@@ -94,6 +94,7 @@ def _croissant(root: Path) -> Iterator[str]:
     try:
         import mlcroissant
     except ImportError:
+        print("Croissant: not validated, needs `pip install mlcroissant`")
         return
     logging.getLogger("absl").setLevel(logging.ERROR)  # it recommends facts that only who publishes knows
     try:

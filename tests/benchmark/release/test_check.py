@@ -1,6 +1,7 @@
 """`release check` finds what is wrong with a release."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,14 @@ def test_croissant_is_checked(copy: Path) -> None:
     path.write_text(path.read_text().replace('"sc:Dataset"', '"sc:Nothing"'))
     resum(copy)
     assert any("croissant.json: not valid" in line for line in find_problems(copy))
+
+
+def test_what_is_not_validated_is_said(
+    copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "mlcroissant", None)
+    assert not list(find_problems(copy))
+    assert capsys.readouterr().out == "Croissant: not validated, needs `pip install mlcroissant`\n"
 
 
 def test_an_index_that_lacks_a_file_is_found(copy: Path) -> None:
