@@ -50,6 +50,7 @@ class WeightFile:
     source: str  # where users find it
     licence: str = "not stated"
     remote_name: str | None = None  # its name at the source, where that is another one
+    command: str = ""  # of spike4dgs, that fetches it; none where the source is a page for people
 
     @property
     def address(self) -> tuple[str, str] | None:
@@ -71,8 +72,11 @@ class WeightFile:
     @property
     def fix(self) -> str:
         """The advice where the file is missing."""
-        command = "run `spike4dgs download weights`, or " if self.address else ""
-        return f"{command}get it from {self.source} and put it there, or set {VARIABLE} to the folder that holds it"
+        if self.command:
+            way = f"run `spike4dgs {self.command}`, or get it from {self.source} and put it there"
+        else:
+            way = f"save the state dict of the network of {self.source} as {self.name} there"
+        return f"{way}, or set {VARIABLE} to the folder that holds it"
 
     @property
     def candidates(self) -> list[Path]:
@@ -121,16 +125,17 @@ class FoundWeights:
         return _sha256(self.path, status.st_size, status.st_mtime_ns)
 
 
-def _trunk(network: str, name: str, size: int, sha256: str) -> WeightFile:
-    return WeightFile(name, size, sha256, f"{network} trunk of LPIPS", TORCHVISION + name, _TORCHVISION_LICENCE)
+def _trunk(network: str, name: str, size: int, sha256: str, word: str) -> WeightFile:
+    purpose, command = f"{network} trunk of LPIPS", f"download weights {word}"
+    return WeightFile(name, size, sha256, purpose, TORCHVISION + name, _TORCHVISION_LICENCE, command=command)
 
 
 _ALEXNET_SHA256 = "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02"
 _VGG16_SHA256 = "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0"
 _SQUEEZENET_SHA256 = "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b"
-ALEXNET = _trunk("AlexNet", "alexnet-owt-7be5be79.pth", 244408911, _ALEXNET_SHA256)
-VGG16 = _trunk("VGG-16", "vgg16-397923af.pth", 553433881, _VGG16_SHA256)
-SQUEEZENET = _trunk("SqueezeNet 1.1", "squeezenet1_1-b8a52dc0.pth", 4958839, _SQUEEZENET_SHA256)
+ALEXNET = _trunk("AlexNet", "alexnet-owt-7be5be79.pth", 244408911, _ALEXNET_SHA256, "lpips")
+VGG16 = _trunk("VGG-16", "vgg16-397923af.pth", 553433881, _VGG16_SHA256, "lpips-vgg")
+SQUEEZENET = _trunk("SqueezeNet 1.1", "squeezenet1_1-b8a52dc0.pth", 4958839, _SQUEEZENET_SHA256, "lpips-squeeze")
 METAIQA = WeightFile(
     "metaiqa_resnet18.pth",
     None,  # several models of that name exist: the prior of TID2013 and KADID-10K, and fine-tuned ones

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from spike4dgs.benchmark.environment import PYTORCH, cpu_name, installed_version, missing_rasterizer
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.weights import ALEXNET, METAIQA, SQUEEZENET, VGG16, WeightsError, find_weights
+from spike4dgs.benchmark.weights import ALEXNET, METAIQA, SQUEEZENET, VGG16, WeightFile, WeightsError, find_weights
 
 OK, MISSING, BROKEN, NOTE = "ok", "missing", "broken", "-"
 _STYLES = {OK: "green", MISSING: "yellow", BROKEN: "bold red", NOTE: "dim"}
@@ -31,6 +31,11 @@ OPTIONAL = (
     ("distributed", "cluster", "`--scheduler` on many machines"),
     ("dask-jobqueue", "cluster", "batch jobs of SLURM, as in docs/cluster.md"),
     ("pandas", "pandas", "results as data frames"),
+    ("fsspec", "download", "`download`"),
+    ("aiohttp", "download", "`download` over http"),
+    ("huggingface_hub", "download", "Hugging Face, in `download` and `release publish`"),
+    ("mlcroissant", "download", "the validation of Croissant in `release check`"),
+    ("optuna", "tuning", "`report tuning`"),
 )
 # Library, its Debian package, and what needs it.
 LIBRARIES = (("usb-1.0", "libusb-1.0-0", "`record` from cameras"), ("umockdev", "umockdev", "the tests of `record`"))
@@ -79,6 +84,7 @@ def examine() -> list[Finding]:
         "GPU": _gpu,
         "optional": _optional,
         "metrics": _metrics,
+        "published images": _published,
         **{name: partial(_network, name, find) for name, find in NETWORKS.items()},
     }
     return [finding for part, check in checks.items() for finding in _try(part, check)]
@@ -195,12 +201,25 @@ def _optional() -> Iterator[Finding]:
 
 def _metrics() -> Iterator[Finding]:
     for name, file in METRIC_WEIGHTS:
-        try:
-            yield Finding(name, OK, find_weights(file).path.name)
-        except WeightsError:
-            damaged = any(path.is_file() for path in file.candidates)
-            found = f"another or a damaged {file.name}" if damaged else f"no {file.name}"
-            yield Finding(name, MISSING, found, f"get {file.source} into {_short(file.candidates[0].parent)}")
+        yield _file(name, file)
+
+
+def _published() -> Iterator[Finding]:
+    from spike4dgs.baselines.images.published.makers import SCFLOW, SPIKECLIP, SSIR, SSML
+
+    for name, network in (("SSML", SSML), ("SSIR", SSIR), ("SpikeCLIP", SPIKECLIP), ("SCFlow", SCFLOW)):
+        yield _file(name, network.file)
+
+
+def _file(name: str, file: WeightFile) -> Finding:
+    """Return whether a weight file is here."""
+    try:
+        return Finding(name, OK, find_weights(file).path.name)
+    except WeightsError:
+        damaged = any(path.is_file() for path in file.candidates)
+        found = f"another or a damaged {file.name}" if damaged else f"no {file.name}"
+    by_hand = f"save the state dict of the network of {file.source} as {_short(file.candidates[0])}"
+    return Finding(name, MISSING, found, f"spike4dgs {file.command}" if file.command else by_hand)
 
 
 def _short(path: Path) -> str:

@@ -43,12 +43,13 @@ FILE = WeightFile(
     "hf://naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt/model.safetensors",
     "CC BY-NC-SA 4.0",
     remote_name="model.safetensors",
+    command="download weights dust3r",
 )
 WEIGHTS = NamedWeights(
     "DUSt3R's weights, model.safetensors of naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt (2.28 GB, licence "
     "CC BY-NC-SA 4.0)",
     variable="SPIKE4DGS_DUST3R",
-    fix="get the file and set SPIKE4DGS_DUST3R to its path",
+    fix=f"run `spike4dgs {FILE.command}`, or get the file and set SPIKE4DGS_DUST3R to its path",
     download=FILE,
 )
 

@@ -1,9 +1,11 @@
 """`doctor`, on this machine, on one without LLVM, and with parts that are missing or broken."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -106,6 +108,29 @@ def test_optional_packages_and_libraries_come_with_their_line(monkeypatch: pytes
     monkeypatch.setattr(doctor, "LIBRARIES", (("no-such-library", "libnothing0", "`record`"),))
     assert found("no-such-package").fix == "pip install 'spike4dgs[viewer]'"
     assert found("libnothing0").fix == "apt-get install libnothing0"
+
+
+def test_each_extra_of_a_command_is_looked_for_and_each_weight_file_has_its_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    own = {"cuda", "cuda12", "test", "docs"}  # a row on CUDA, and what developers need
+    wanted = {
+        (re.split(r"[^\w-]", line)[0], extra)
+        for extra, lines in project["optional-dependencies"].items()
+        for line in lines
+        if extra not in own
+    }
+    assert {(package, extra) for package, extra, _ in doctor.OPTIONAL} == wanted
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.delenv("SPIKE4DGS_WEIGHTS", raising=False)
+    assert found("LPIPS alex").fix == "spike4dgs download weights lpips"
+    assert found("SCFlow") == Finding("SCFlow", MISSING, "no scflow_dt10.pth", "spike4dgs download weights scflow")
+    assert found("MetaIQA").fix.startswith("save the state dict of the network of https://github.com/zhuhancheng/")
+    assert found("MetaIQA").fix.endswith(f" as {tmp_path}/hub/checkpoints/metaiqa_resnet18.pth")
+    monkeypatch.delenv("SPIKE4DGS_DUST3R", raising=False)
+    monkeypatch.setattr(doctor, "NETWORKS", {"DUSt3R": partial(doctor._weights, "DUSt3R")})
+    assert found("DUSt3R").fix.startswith("run `spike4dgs download weights dust3r`, or")
 
 
 def test_a_gpu_without_kernels_is_optional_and_named(monkeypatch: pytest.MonkeyPatch) -> None:

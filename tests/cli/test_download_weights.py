@@ -124,6 +124,13 @@ def test_all_are_listed_without_a_name(capsys: pytest.CaptureFixture[str]) -> No
     assert text.count("licence:") == 9
 
 
+def test_each_file_names_the_command_that_fetches_it() -> None:
+    known = {**FILES, "lpips": ALEXNET, "dust3r": DUST3R}
+    expected = {name: f"download weights {name}" if file.address else "" for name, file in known.items()}
+    assert {name: file.command for name, file in known.items()} == expected
+    assert "run `spike4dgs download weights ssml`, or" in known["ssml"].fix and "state dict" in known["metaiqa"].fix
+
+
 def test_the_known_addresses() -> None:
     assert ALEXNET.address == ("https://download.pytorch.org/models", "alexnet-owt-7be5be79.pth")
     assert FILES["metaiqa"].address is None
