@@ -4,11 +4,13 @@ import os
 from typing import TYPE_CHECKING
 
 from spike4dgs.benchmark.lazy import lazy_names
+from spike4dgs.benchmark.machine.quota import limit_openmp
 
 # Before torch loads OpenMP, which reads these once: its threads wait asleep. Spinning, they take the cores from one
 # another and from our own threads as soon as another program runs.
 if "GOMP_SPINCOUNT" not in os.environ:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+limit_openmp(os.environ)
 
 
 def _has_avx2() -> bool:

@@ -29,6 +29,7 @@ from typing import Any
 import psutil
 
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.machine.quota import quota_cores
 
 PYTORCH = "install PyTorch with CUDA from pytorch.org"
 
@@ -274,7 +275,8 @@ def processor(cpuinfo: str) -> str:
 def available_cores() -> int:
     """Return the number of cores that this process may use; those of the machine where the system does not tell."""
     if hasattr(os, "sched_getaffinity"):  # Linux: a call that hot paths afford; psutil reads files first
-        return len(os.sched_getaffinity(0))
+        cores = len(os.sched_getaffinity(0))
+        return min(cores, quota_cores() or cores)
     process = psutil.Process()
     return len(process.cpu_affinity()) if hasattr(process, "cpu_affinity") else psutil.cpu_count() or 1
 

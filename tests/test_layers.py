@@ -22,8 +22,8 @@ MAY_IMPORT = {
 }
 # The modules and folders of each room, low to high: each imports only those before it.
 ORDER = {
-    "benchmark": "errors arrays lazy plugins variants json_values files compilation schemas untrusted croissant "
-    "environment weights screen spikes scene exchange release metrics method runs reports",
+    "benchmark": "errors arrays lazy machine plugins variants json_values files compilation schemas untrusted "
+    "croissant environment weights screen spikes scene exchange release metrics method runs reports",
     "generators": "physics sensor profiles worlds rig other_sensors recorder rendering msdi_data streams render_tasks "
     "truth held_frames previews scene_maker shared_rendering scene_differences scene_check make_dataset",
     "method": "torch_state two_threads settings splat array_path gaussians training_views motion supervision "

@@ -14,6 +14,9 @@ from pathlib import Path
 import pytest
 
 from spike4dgs.benchmark import _has_avx2
+from spike4dgs.benchmark import environment as environments
+from spike4dgs.benchmark.machine import quota
+from spike4dgs.benchmark.machine.quota import limit_openmp, quota_cores
 
 NAMES = ("OPENBLAS_CORETYPE", "OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
 ROOMS = ("benchmark", "generators", "method", "baselines", "leaderboard", "cli")
@@ -61,3 +64,35 @@ def test_what_the_user_says_stays(given: dict[str, str]) -> None:
     shown = run(f"import os, sys, spike4dgs.benchmark; {SHOW}", **given).stdout.strip()
     kernels = given.get("OPENBLAS_CORETYPE", "Haswell" if _has_avx2() else None)
     assert shown == f"{[kernels, *(given.get(name) for name in NAMES[1:])]} False"
+
+
+@pytest.mark.parametrize(
+    ("files", "cores"),
+    [
+        ({"cpu.max": "200000 100000\n"}, 2),
+        ({"cpu.max": "150000 100000\n"}, 2),
+        ({"cpu.max": "max 100000\n"}, None),
+        ({"cpu/cpu.cfs_quota_us": "300000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 3),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, None),
+        ({}, None),
+    ],
+)
+def test_the_cores_of_a_container_are_known(files: dict[str, str], cores: int | None, tmp_path: Path) -> None:
+    (tmp_path / "cpu").mkdir()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    assert quota_cores(str(tmp_path)) == cores
+
+
+@pytest.mark.parametrize(("limit", "cores"), [(None, 8), (3, 3), (16, 8)])
+def test_a_container_with_less_time_than_cores_has_fewer_threads(
+    limit: int | None, cores: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    for module in (quota, environments):
+        monkeypatch.setattr(module, "quota_cores", lambda: limit)
+    given, unset = {"OMP_NUM_THREADS": "5"}, dict[str, str]()
+    for environment in (given, unset):
+        limit_openmp(environment)
+    assert environments.available_cores() == cores
+    assert given == {"OMP_NUM_THREADS": "5"} and unset == ({"OMP_NUM_THREADS": "3"} if limit == 3 else {})

@@ -1,0 +1,1 @@
+"""What this machine grants a process. Nothing here imports a library."""
