@@ -7,6 +7,7 @@ each worker once. One of `unordered_executor` yields each result as soon as it i
 from __future__ import annotations
 
 import os
+import pickle
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -97,7 +98,7 @@ def _ordered(results: Iterator[tuple[int, R]]) -> Iterator[R]:
 @contextmanager
 def _pool(task: Callable[[Any], Any], workers: int) -> Iterator[ProcessPoolExecutor]:
     context = get_context("spawn")
-    arguments = (task, context.Value("i", 0), workers, os.getpid())
+    arguments = (pickle.dumps(task), context.Value("i", 0), workers, os.getpid())
     pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=arguments)
     at_work = True
     try:
@@ -113,10 +114,9 @@ def _pool(task: Callable[[Any], Any], workers: int) -> Iterator[ProcessPoolExecu
             process.terminate()
 
 
-def _start_worker(task: Callable[[Any], Any], started: Any, workers: int, parent: int) -> None:
-    """Take this worker's share of the cores, which libraries ask for as they load, and keep the task."""
+def _start_worker(task: bytes, started: Any, workers: int, parent: int) -> None:
+    """Take this worker's share of the cores, which libraries ask for as they load, then load the task and keep it."""
     global _task
-    _task = task
     threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
     with started.get_lock():
         index, started.value = started.value, started.value + 1
@@ -127,7 +127,8 @@ def _start_worker(task: Callable[[Any], Any], started: Any, workers: int, parent
         process.cpu_affinity(share)
     import drjit
 
-    drjit.set_thread_count(len(share))
+    drjit.set_thread_count(min(len(share), available_cores()))
+    _task = pickle.loads(task)
 
 
 def _die_with(parent: int) -> None:

@@ -76,6 +76,26 @@ def test_unordered_results_come_as_they_end_with_their_positions(tmp_path):
         assert sum(map(len, shares)) <= len(mine), "workers share no core"
 
 
+class Loaded:
+    """A task that notes the cores that it was loaded with, as a library does."""
+
+    def __setstate__(self, state):
+        self.cores = os.sched_getaffinity(0)
+
+    def __getstate__(self):
+        return True
+
+    def __call__(self, chunk):
+        return self.cores == os.sched_getaffinity(0)
+
+
+def test_a_worker_has_its_cores_before_it_loads_the_task():
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("one core is nobody's share")
+    with executor(2) as run:
+        assert list(run(Loaded(), range(2))) == [True, True]
+
+
 def pid_of(chunk):
     time.sleep(0.02)
     return os.getpid()
