@@ -108,3 +108,13 @@ def test_a_changed_library_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
         write_site(tmp_path / "page", small())
     listed = {line.partition("  ")[2] for line in (vendor / "SHA256SUMS").read_text().splitlines()}
     assert listed == {p.name for p in vendor.iterdir()} - {"SHA256SUMS"}
+
+
+def test_the_notice_names_each_licence_and_where_files_are_installed(pytestconfig: pytest.Config) -> None:
+    root = pytestconfig.rootpath
+    notice = (root / "NOTICE").read_text()
+    parts = {path.name.partition(".")[2] for path in (site.STATIC / "vendor").glob("LICENSE.*")}
+    assert {"interval-tree-1d", "binary-search-bounds", "isoformat", "delaunator"} <= parts
+    assert not [part for part in parts if not re.search(rf"\b{part}\b", notice)]
+    installed = re.findall(r"file (\S+) \(installed as spike4dgs/(\S+)\)", notice)
+    assert len(installed) == 2 and all(path == there and (root / path).is_file() for path, there in installed)
