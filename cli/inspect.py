@@ -113,7 +113,7 @@ def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
         axes[name].imshow(encode_srgb(IMAGES[name](stream, [middle], gain)[0]), cmap="gray", vmin=0, vmax=255)
         axes[name].set_title(f"{name.upper()} at tick {middle}")
     _show_bad_pixels(axes["bad"], report)
-    axes["rates"].hist(report.rate.ravel(), bins=100, color="0.3")
+    axes["rates"].hist(report.rate.ravel(), bins=_between_counts(report), color="0.3")
     axes["rates"].set(xlabel="spikes per tick", ylabel="pixels", title=f"Rates, mean {report.rate.mean():.4f}")
     if stream.gaps:
         _plot_gaps(axes["time"], stream)
@@ -121,6 +121,14 @@ def write_image(path: Path, report: StreamReport, stream: SpikeStream) -> None:
         axes[name].set(xticks=[], yticks=[])
     figure.suptitle(f"{report.name}: {stream.n_ticks} ticks of {stream.width}x{stream.height} at {stream.rate_hz:g} Hz")
     save_figure(figure, path)
+
+
+def _between_counts(report: StreamReport) -> NDArray[np.float64]:
+    """Return the edges of at most about 100 bins that hold equally many counts each: rates are whole spikes a clip."""
+    ticks = max(report.n_ticks - report.missing, 1)
+    most = round(float(report.rate.max()) * ticks)
+    step = -(-(most + 1) // 100)
+    return (np.arange(0, most + 1 + step, step) - 0.5) / ticks
 
 
 def _middle(stream: SpikeStream) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,12 +42,13 @@ class Layout:
     zoom: int
     columns: int
     cells: int
+    foot: int  # lines of the legend
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the frames, both even."""
         width = GAP + self.columns * (self.panel[0] + GAP)
-        height = GAP + math.ceil(self.cells / self.columns) * self.cell_height + 2 * LINE + GAP
+        height = GAP + math.ceil(self.cells / self.columns) * self.cell_height + self.foot * LINE + GAP
         return width + width % 2, height + height % 2
 
     @property
@@ -92,7 +93,8 @@ def make_layout(panels: Panels) -> Layout:
     cells = 1 + len(panels.scored)
     most = max(1, (WIDEST - GAP) // (w * zoom + GAP))
     head = max(len(_name(name, w * zoom)) for name in ("ground truth", *panels.scored))
-    return Layout((w * zoom, h * zoom), head, zoom, math.ceil(cells / math.ceil(cells / most)), cells)
+    layout = Layout((w * zoom, h * zoom), head, zoom, math.ceil(cells / math.ceil(cells / most)), cells, 0)
+    return replace(layout, foot=len(_legend(panels, layout.size[0])))
 
 
 def _name(name: str, width: int) -> list[str]:
@@ -147,10 +149,15 @@ def _ground(panels: Panels, layout: Layout) -> UInt8:
                 (x, y + layout.head * LINE, f"{scale_name(panels.scales[name])}: 0 to {panels.scales[name]:g}")
             )
     width, height = layout.size
-    legend = f"{_speed(panels)}Errors: |render - truth| of linear radiance, black is 0, 1 is white in the image."
-    for n, line in enumerate(textwrap.wrap(legend, int(width / _font(FONT).getlength("n")))[:2]):
-        lines.append((GAP, height - GAP - (2 - n) * LINE, line))
+    for n, line in enumerate(_legend(panels, width)):
+        lines.append((GAP, height - GAP - (layout.foot - n) * LINE, line))
     return _with_text(np.full((height, width, 3), GROUND, np.uint8), lines)
+
+
+def _legend(panels: Panels, width: int) -> list[str]:
+    """Return the lines of the legend that fit into `width` pixels."""
+    legend = f"{_speed(panels)}Errors: |render - truth| of linear radiance, black is 0, 1 is white in the image."
+    return textwrap.wrap(legend, int(width / _font(FONT).getlength("n")))
 
 
 def _speed(panels: Panels) -> str:

@@ -18,7 +18,7 @@ from spike4dgs.benchmark.scene.images import encode_srgb
 from spike4dgs.benchmark.spikes.bad_pixels import from_recordings, isolated
 from spike4dgs.benchmark.spikes.stream import SpikeStream, open_stream, pack
 from spike4dgs.cli import main
-from spike4dgs.cli.inspect import examine, inspect, write_image
+from spike4dgs.cli.inspect import _between_counts, examine, inspect, write_image
 
 
 def steady(ticks: int = 400, height: int = 24, width: int = 40) -> np.ndarray:
@@ -46,6 +46,15 @@ def test_bad_pixels_are_found_and_no_others() -> None:
     np.testing.assert_allclose(report.rate, fired.mean(axis=0), atol=1e-12)
     assert sorted(map(tuple, np.argwhere(report.bad.dead))) == [(5, 7), (20, 30)]
     assert list(map(tuple, np.argwhere(report.bad.hot))) == [(11, 13)]
+
+
+@pytest.mark.parametrize(("most", "width"), [(0, 1), (60, 1), (320, 4)])
+def test_bins_of_rates_lie_between_counts(most: int, width: int) -> None:
+    fired = np.arange(400)[:, None, None] < np.arange(most + 1)[None, None, :]
+    report = examine("made", stream_of(fired))
+    pixels, edges = np.histogram(report.rate, _between_counts(report))
+    assert set(pixels[:-1]) <= {width} and pixels.sum() == most + 1 and len(pixels) <= 100
+    assert edges[0] == -0.5 / 400
 
 
 def test_bright_lines_and_dark_ones_are_no_bad_pixels() -> None:

@@ -16,6 +16,7 @@ from matplotlib.text import Text
 from pypdf import PdfReader
 from sheets import Results, write_results
 
+from spike4dgs.benchmark.reports import sheet_video
 from spike4dgs.benchmark.reports.error_map import OFF_SCALE, SCALES, absolute_error
 from spike4dgs.benchmark.reports.panels import SMALLEST, Panels, bounds, crops, make_panels
 from spike4dgs.benchmark.reports.sheet import make_sheet, write_sheet
@@ -214,7 +215,7 @@ def test_frames_decode_and_are_the_sheets_panels(tmp_path: Path) -> None:
 
 
 def test_panels_do_not_overlap_and_wrap_into_rows() -> None:
-    layout = Layout((230, 120), 2, 3, 5, 14)
+    layout = Layout((230, 120), 2, 3, 5, 14, 2)
     used = np.zeros(layout.size[::-1], int)
     for cell in range(14):
         used[layout.image(cell)] += 1
@@ -223,6 +224,21 @@ def test_panels_do_not_overlap_and_wrap_into_rows() -> None:
         assert layout.image(cell)[0].start - y == 54, "room for two lines of a name and its scale"
     assert used.max() == 1 and used.sum() == 14 * 2 * 230 * 120
     assert layout.size[0] <= WIDEST and not any(side % 2 for side in layout.size)
+
+
+def test_the_legend_is_whole_below_one_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = write_results(tmp_path, {"m": 0.1})
+    panels, drawn = make_panels(results.scene, results.folders, results.records), []
+    monkeypatch.setattr(sheet_video, "PANEL", 120)
+    monkeypatch.setattr(sheet_video, "_with_text", lambda frame, lines: drawn.extend(lines) or frame)
+    layout = make_layout(panels)
+    sheet_video._ground(panels, layout)
+    end = max(layout.errors(cell)[0].stop for cell in range(layout.cells))
+    legend = [(y, text) for _, y, text in drawn if y >= end]
+    assert " ".join(text for _, text in legend).endswith(
+        "Errors: |render - truth| of linear radiance, black is 0, 1 is white in the image."
+    )
+    assert len(legend) == layout.foot > 2 and legend[-1][0] + sheet_video.LINE <= layout.size[1]
 
 
 def test_many_methods_stay_within_the_widest_frame(tmp_path: Path) -> None:
