@@ -71,6 +71,7 @@ def test_the_quickstart_runs_and_shows_cards_bars_and_scores(tiny_data: Path, tm
     (run,) = (cell for cell in notebook.cells if cell.source.startswith('main("run-benchmark '))
     run.source = run.source.replace("--budget 0.05 --out ", "--budget 0.01 --metrics psnr --in-process --out ")
     assert "--in-process" in run.source
+    assert "by mean PSNR" in "".join(map(texts, run.outputs)), "stored when the command printed what it prints today"
     no_sheets = "from spike4dgs.benchmark.reports import benchmark\nbenchmark._write_images = lambda *_: []\n"
     run.source = no_sheets + run.source
     place = {"metadata": {"path": str(tmp_path)}}
