@@ -226,6 +226,8 @@ def read_arrays(path: Path, *names: str) -> dict[str, NDArray[Any]]:
         with open(path, "rb") as f, np.load(f) as data:
             return {name: data[name] for name in names or data.files}
     except FileNotFoundError:
-        raise problem(path, "a key frame", "no such file", "run the same command again") from None
+        raise problem(path, "arrays of a rendering", "no such file", "run the same command again") from None
     except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as e:
-        raise problem(path, "a key frame", f"damaged data ({e})", "delete it and run the same command again") from None
+        raise problem(
+            path, "arrays of a rendering", f"damaged data ({e})", "delete it and run the same command again"
+        ) from None

@@ -124,13 +124,13 @@ def test_equal_keys_give_equal_bytes(store, tmp_path):
 
 def test_damage_and_bad_images_are_named(store):
     static, images, fast = make_images()
-    with pytest.raises(UserError, match="000099.npz: expected a key frame, found no such file"):
+    with pytest.raises(UserError, match="000099.npz: expected arrays of a rendering, found no such file"):
         store.given(99, 0)
     path = store.folder / "000010.npz"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
-    with pytest.raises(UserError, match="000010.npz: expected a key frame, found damaged data"):
+    with pytest.raises(UserError, match="000010.npz: expected arrays of a rendering, found damaged data"):
         store.given(10, 0), store.given(10, 1)
     path.write_bytes(data[:50])
     with pytest.raises(UserError, match="delete it and run"):
