@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from spike4dgs.benchmark.arrays import UInt8
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import atomic_path
@@ -13,8 +15,8 @@ from spike4dgs.benchmark.files import atomic_path
 # By suffix: codecs in order of preference. MPEG-4 part 2 is for builds of OpenCV without libvpx: players show it,
 # browsers do not. Motion JPEG opens everywhere and is several times larger.
 CODECS = {".mp4": ("vp09", "mp4v"), ".avi": ("MJPG",)}
-# OpenCV rounds a colour's chroma down; with this much more blue and red (BGR) a gray of a colour frame stays gray.
-NEUTRAL = (2, 0, 1, 0)
+# OpenCV rounds a colour's chroma down; with this much more red and blue (RGB) a gray of a colour frame stays gray.
+NEUTRAL = np.array([1, 0, 2], np.uint8)
 Write = Callable[[UInt8], None]
 
 
@@ -52,13 +54,17 @@ def video_writer(path: Path, size: tuple[int, int], fps: float, *, gray: bool) -
             count += 1
             if frame.shape[:2] != size[::-1]:
                 raise problem(path, f"frames of {size[0]}x{size[1]}", f"{frame.shape}", "render all at one size")
-            writer.write(frame if gray else cv2.add(frame[:, :, ::-1], NEUTRAL))
+            writer.write(frame if gray else np.ascontiguousarray(_neutral(frame)[:, :, ::-1]))
 
         try:
             yield write
         finally:
             writer.release()
         _check_whole(part, path, count)
+
+
+def _neutral(frame: UInt8) -> UInt8:
+    return np.minimum(frame, 255 - NEUTRAL) + NEUTRAL
 
 
 def _check_whole(part: Path, path: Path, frames: int) -> None:
