@@ -203,7 +203,7 @@ def render_targets(
     `where` names it in errors. The costs are those of `COSTS` but for `fit_seconds`; one rendering before is uncounted.
     """
     render_seconds, size = 0.0, getattr(model, "size_bytes", None)
-    for n, target in enumerate((scene.targets[0], *scene.targets)):
+    for n, target in enumerate((*scene.targets[:1], *scene.targets)):
         camera, t_us = cameras[target.camera], scene.t_us(target.tick)
         start = time.perf_counter()
         image = _render(model, camera, t_us, f"{where}, {target.name}")
