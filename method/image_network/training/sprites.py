@@ -3,7 +3,8 @@
 A burst of `make-msdi-data` holds the light of 43 ticks. The windows of `adaptive`, and what a clip's mean shows, reach
 over hundreds, and over all of them things go on moving. So what moves here is drawn in the plane: a sprite is another
 image behind a soft outline, which moves evenly, accelerates and turns, or a shadow, which darkens what it passes. Its
-light is exact, and its motion of any speed.
+light is exact, its motion of any speed, and its texture about as sharp as what it covers: a pixel of its image is a
+fine one.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from spike4dgs.benchmark.arrays import Float32, Mask
 _SLOWEST, _FASTEST = 0.004, 0.2  # px a tick
 _KEY_PX = 0.6  # motion between two images
 _MOST_KEYS = 160
-_FINE = 2  # times the image's resolution: sprites are drawn so, and averaged
+_FINE = 2  # times the image's resolution: sprites are drawn so, a source's pixel to a fine one, and averaged
 _EDGE = 0.02  # share of a pixel from which it counts as covered
 _NEAR_TICKS = 10  # what moves covers a pixel so many ticks before or after
 
@@ -75,18 +76,18 @@ def with_sprites(image: Float32, others: Sequence[Float32], ticks: int, rng: np.
     times = np.arange(-(-ticks // spacing) + 1) * spacing
     keys, covered = np.empty((len(times), *sides), np.float32), np.zeros((len(times), *sides), bool)
     size = (_FINE * image.shape[1], _FINE * image.shape[0])
-    fine = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.float32)
+    fine = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.float32)  # averages are the image
     sprites = [(*_sprite(other, sides, rng), path) for other, path in zip(others, paths, strict=True)]
     for key, seen, t in zip(keys, covered, times.tolist(), strict=True):
         drawn, mask = fine.copy(), np.zeros_like(fine)
-        for texture, outline, shadow, path in sprites:
+        for light, outline, shadow, path in sprites:
             middle = complex(outline.shape[1], outline.shape[0]) / 2
             placed = _warped(outline, path.matrix(t, middle), fine.shape)
             drawn *= 1 - placed * (1 - shadow)
             if shadow == 0:
-                drawn += placed * _warped(texture, path.matrix(t, middle), fine.shape)
+                drawn += _warped(light, path.matrix(t, middle), fine.shape)
             mask = np.maximum(mask, placed)
-        key[:] = image + _coarse(drawn - fine)
+        key[:] = _coarse(drawn)
         seen[:] = _coarse(mask) > _EDGE
     return Clip(keys, covered, spacing)
 
@@ -105,18 +106,21 @@ def _path(sides: np.ndarray, speed: float, ticks: int, rng: np.random.Generator)
 
 
 def _sprite(other: Float32, sides: np.ndarray, rng: np.random.Generator) -> tuple[Float32, Float32, float]:
-    """Return texture and outline, both of one size in fine pixels, and what it lets through: 0, or a shadow's share."""
+    """Return light and outline, both of one size in fine pixels, and what passes through: 0, or a shadow's share.
+
+    An image that is smaller is mirrored at its ends.
+    """
     side = int(_FINE * sides.min() * rng.uniform(0.25, 0.9))
-    at = [int(rng.integers(0, max(1, s - side // _FINE))) for s in other.shape]
-    part = other[at[0] : at[0] + side // _FINE + 1, at[1] : at[1] + side // _FINE + 1]
-    texture = cv2.resize(part, (side, side), interpolation=cv2.INTER_LINEAR) * np.float32(np.exp(rng.normal() * 0.3))
+    rows, columns = (int(rng.integers(0, max(1, s - side + 1))) + np.arange(side) for s in other.shape)
+    whole = np.pad(other, [(0, max(0, side - s)) for s in other.shape], mode="symmetric")
+    texture = whole[np.ix_(rows, columns)] * np.float32(np.exp(rng.normal() * 0.3))
     shadow = float(rng.uniform(0.2, 0.8)) if rng.random() < 0.2 else 0.0
     v, u = (np.mgrid[:side, :side] + 0.5) / side * 2 - 1
     angle, radius = np.arctan2(v, u), np.hypot(u, v)
     outline = 0.65 + sum(0.25 / k * rng.normal() * np.cos(k * angle + rng.uniform(0, 6.3)) for k in range(1, 7))
     soft = rng.uniform(4, 20) if shadow else 1.0  # fine pixels
     mask = np.clip((np.clip(outline, 0.15, 0.95) - radius) * side / 2 / soft + 0.5, 0, 1)
-    return texture.astype(np.float32), mask.astype(np.float32), shadow
+    return (texture * mask).astype(np.float32), mask.astype(np.float32), shadow
 
 
 def _warped(image: Float32, matrix: Float32, shape: tuple[int, ...]) -> Float32:

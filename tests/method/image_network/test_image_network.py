@@ -12,7 +12,7 @@ from toy_bursts import toy_burst, write_toy_shard
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
-from spike4dgs.benchmark.scene.calibration import Calibration
+from spike4dgs.benchmark.scene.calibration import Calibration, Recordings, estimate
 from spike4dgs.benchmark.scene.training_bursts import open_bursts
 from spike4dgs.benchmark.spikes.stream import SpikeStream, pack
 from spike4dgs.method.checkpoint import load_checkpoint
@@ -20,6 +20,7 @@ from spike4dgs.method.image_network.config import INPUTS, MOVING_LOSS, TINY, Ima
 from spike4dgs.method.image_network.inputs import BESIDE, image_inputs
 from spike4dgs.method.image_network.maker import reconstruct
 from spike4dgs.method.image_network.network import ImageNetwork, log_mse, rate_of
+from spike4dgs.method.image_network.training import data
 from spike4dgs.method.image_network.training.data import draw, seen
 from spike4dgs.method.image_network.training.evaluate import CONDITIONS, evaluate
 from spike4dgs.method.image_network.training.sprites import Clip, still, with_sprites
@@ -28,6 +29,7 @@ from spike4dgs.method.image_network.weights import WEIGHTS, load_image_network
 from spike4dgs.method.images.adaptive import adaptive_image
 from spike4dgs.method.matching.training.data import at_light, record
 from spike4dgs.method.matching.window_inputs import rates_over_windows, window_inputs
+from spike4dgs.method.msdi.training_data import Pixels, fire
 
 SETTINGS = ImageTraining(steps=6, bursts=2, views=1, instants=2, warm_up=2, longest=120)
 
@@ -169,19 +171,69 @@ def test_spikes_of_a_clip_are_those_of_its_light() -> None:
         assert spikes.mean().item() == pytest.approx((0.1 + 0.01 * (tick + 0.5)) * 0.6, rel=0.02)
 
 
+def test_a_known_sensor_is_known_as_well_as_recordings_tell() -> None:
+    """Those of scenes: 500 ticks under uniform light of 0.42 spikes a tick, and 2000 in the dark."""
+    rng, size = np.random.default_rng(0), (32, 48)
+    gain = np.exp(0.05 * rng.standard_normal(size)).astype(np.float32)
+    dark = rng.uniform(0.003, 0.006, size).astype(np.float32)
+    gain /= gain.mean()
+    streams = []
+    for light, ticks in ((0.42, 500), (0.0, 2000)):
+        pixels = Pixels(np.full((2, *size), light, np.float32), gain, dark, 5e4, ticks)
+        streams.append(SpikeStream(pack(fire(pixels, ticks, rng.random(size, np.float32), rng)), 48, 32, 20_000.0))
+    found = estimate(Recordings(streams[0], streams[1], 0.7))
+    batch = seen(still(np.full(size, 0.5, np.float32), 41), (gain, dark), at_light(1.0), [20], (0.6, 5e4), rng)
+    trained = (batch.channels[0, 6].numpy() + 1) / gain - 1
+    assert trained.std() == pytest.approx((found.gain / gain - 1).std(), rel=0.3)
+    assert data._DARK_ERROR == pytest.approx((found.dark - dark).std(), rel=0.5)
+
+
 def test_a_sprite_covers_what_is_behind_it_and_moves_as_its_path_says() -> None:
     """A bright sprite before black: its light's middle moves evenly, or accelerates; elsewhere nothing changes."""
     for seed in range(6):
         rng = np.random.default_rng(seed)
         clip = with_sprites(np.zeros((64, 96), np.float32), [np.ones((64, 104), np.float32)], 300, rng)
         assert len(clip.keys) == -(-300 // clip.spacing) + 1
-        assert (clip.keys >= -1e-5).all() and clip.keys[~clip.covered].max() < 0.06
+        assert (clip.keys >= 0).all() and clip.keys[~clip.covered].max() < 0.06
         v, u = np.mgrid[:64, :96]
         inside = [k for k, seen in enumerate(clip.covered) if seen[3:-3, 3:-3].sum() == seen.sum() > 30]
         middles = [complex((clip.keys[k] * u).sum(), (clip.keys[k] * v).sum()) / clip.keys[k].sum() for k in inside]
         if len(middles) > 3 and np.diff(inside).max() == 1 and clip.keys[inside[0]].max() > 0.5:
             assert np.abs(np.diff(middles)).max() < 1.2, "images lie densely"
             assert np.abs(np.diff(middles, n=3)).max() < 0.1, "a path is a parabola"
+
+
+def _before_black(other: np.ndarray, seed: int) -> Clip:
+    return with_sprites(np.zeros((64, 96), np.float32), [other], 300, np.random.default_rng(seed))
+
+
+def test_the_light_of_sprites_is_exact() -> None:
+    """A sprite of one brightness has it throughout, before a background that it covers fully and leaves as it is."""
+    rng = np.random.default_rng(0)
+    background, even = rng.random((64, 96), np.float32), np.ones((64, 104), np.float32)
+    for seed in (1, 3, 4):
+        alone = _before_black(even, seed).keys
+        within = alone > 0.999 * alone.max()
+        clip = with_sprites(background, [even], 300, np.random.default_rng(seed))
+        assert (clip.keys >= 0).all() and within.sum() > 1000
+        np.testing.assert_allclose(clip.keys[within], alone.max(), rtol=2e-3)
+        k, v, u = np.nonzero(~clip.covered & (alone == 0))
+        np.testing.assert_array_equal(clip.keys[k, v, u], background[v, u])
+
+
+def test_what_moves_is_about_as_sharp_as_an_image() -> None:
+    """Neighbouring pixels of a white texture stay nearly independent, and lose a fifth of what averages leave."""
+    white = (1 + 0.2 * np.random.default_rng(9).standard_normal((48, 104))).astype(np.float32)  # less than a sprite's
+    kept, alike = [], []
+    for seed in (1, 3, 4, 10):
+        even, clip = _before_black(np.ones_like(white), seed).keys, _before_black(white, seed).keys
+        within = even > 0.999 * even.max()
+        k = int(within.sum(axis=(1, 2)).argmax())
+        texture, both = clip[k] / even.max(), within[k, :, 1:] & within[k, :, :-1]
+        variance = texture[within[k]].var()
+        kept.append(np.sqrt(variance))
+        alike.append(1 - np.diff(texture)[both].var() / (2 * variance))
+    assert np.mean(kept) > 0.75 * 0.2 / 2 and np.mean(alike) < 0.2
 
 
 def test_a_clip_at_rest_has_one_image() -> None:
