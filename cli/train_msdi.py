@@ -49,7 +49,7 @@ def train_msdi(
             images: it uses only data, out, start, steps, seed and device), or an ablation of the latter
             (images-without-spikes, -error-bar, -windows, -beside, -sensor, or -moving-loss).
         start: Weights to start from: an earlier training's, or, for paper, Fast3R's or DUSt3R's published file. For
-            bottleneck, their steps count towards --steps.
+            bottleneck, their steps count towards --steps; the others train for --steps more, on other batches.
         steps: Number of steps.
         views: Total number of views per step: samples times views per sample (2 to 8).
         rate: Adam's learning rate, after the warm-up, for the layers that predict points.

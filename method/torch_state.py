@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
+from torch import nn
 
 from spike4dgs.benchmark.environment import device_type
 from spike4dgs.benchmark.errors import problem
@@ -24,6 +25,17 @@ def check_device(device: str) -> None:
 def seeded(seed: int, step: int) -> torch.Generator:
     """Return the generator of one step's random numbers."""
     return torch.Generator().manual_seed((seed * 1_000_003 + step) % 2**63)
+
+
+@torch.no_grad()
+def follow(mean: nn.Module, live: nn.Module, step: int, average: float) -> None:
+    """Move the running mean of a network's weights after `step` steps; the share `average` of it stays.
+
+    The first steps are soon forgotten: of n, the mean is over about the last tenth until `average` is reached.
+    """
+    share = min(average, step / (step + 9))
+    for own, parameter in zip(mean.parameters(), live.parameters(), strict=True):
+        own.lerp_(parameter, 1 - share)
 
 
 @contextmanager

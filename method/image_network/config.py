@@ -42,9 +42,12 @@ class ImageTraining:
     instants: int = 4  # of a clip
     crop: tuple[int, int] = (64, 96)  # height and width in px; less where images are smaller
     moving: float = 0.75  # share of the clips in which something moves
-    well_lit: float = 0.5  # share of the clips in at least half of the light; the others have down to a sixteenth
+    # Share of the clips in half of the light to all of it; the others have a sixteenth to all, in stops. So 62.5 % of
+    # all clips have at least half.
+    well_lit: float = 0.5
     lr: float = 1e-3  # Adam's, after the warm-up; it falls to 0 with the cosine
     warm_up: int = 300  # steps
+    average: float = 0.998  # of the weights that are used: the mean over about 500 steps
     unknown_sensors: float = 0.3  # of the bursts
     longest: int = 600  # ticks of a clip
 

@@ -29,6 +29,7 @@ class StartWeights:
     name: str  # of the file
     sha256: str
     shards: Set[str] = frozenset()  # that they were trained on, as ID@SHA256
+    steps: int = 0  # of their training, where it was one of ours
 
 
 class Curve:
@@ -165,7 +166,9 @@ def model_card(
     command += f" --rate {settings.lr_points:g} --seed {card.seed}"
     command += f" --start {start.name}" if start else ""
     most = min(settings.most_views, settings.views)
-    began = f"Begun with the weights `{start.name}`, sha256 `{start.sha256}`. " if start else ""
+    earlier = f" of step {start.steps}" if start and start.steps else ""
+    began = f"Begun with the weights `{start.name}`{earlier}, sha256 `{start.sha256}`. " if start else ""
+    steps = card.steps - (start.steps if start else 0)
     commands = "\n".join(f"  `{line}`," for line in data_commands(facts))
     return f"""# Model card: MSDI, configuration `{card.config}`
 
@@ -181,7 +184,7 @@ Weights of step {card.steps}, as half floats, sha256 `{sha256}`.
   for training, nor is any world's own rig. Spikes are simulated anew at every use, with random sensors, brightness,
   views and direction of time, and mirrored half of the time.
 - Loss: L1 of radiance for extractor and generator, DUSt3R's confidence-weighted regression of points for the rest.
-- {card.steps} steps of {settings.views} views in total, 2 to {most} per sample; Adam at
+- {steps} steps of {settings.views} views in total, 2 to {most} per sample; Adam at
   {settings.lr_points:g} ({settings.lr_images:g} for extractor and generator) after {settings.warm_up} steps of warm-up,
   falling to 0 along a cosine over {settings.steps} steps; gradients of both clipped at norm 1; seed {card.seed}. In
   {settings.unknown_share:.0%} of the steps the intrinsics are withheld, in {settings.raw_share:.0%} the sensors.

@@ -5,7 +5,8 @@ points (`losses`), which trains everything behind them. Each step has a fixed nu
 views, or many of few.
 
 All randomness comes from (seed, step): on one machine, with the same data, a killed run continues from its checkpoint
-with the bits of a run that never stopped.
+with the bits of a run that never stopped. Steps of weights that begin a training count for its batches and its card,
+not for its schedule.
 """
 
 from __future__ import annotations
@@ -75,11 +76,12 @@ class Training:
         points: list[Tensor] = [p for p in self.network.parameters() if id(p) not in own]
         self.adam = Adam({"images": images, "points": points}, (0.9, 0.999))
         self.step = 0
+        self.before = 0  # steps of the weights that began the training
         self._take = _ahead(self.batch, settings.steps) if device_type(device) == "cuda" else self.batch
 
     def batch(self, step: int) -> Batch:
-        """Return the batch of a step, a function of the seed and the step."""
-        rng = np.random.default_rng([self.seed, step])
+        """Return the batch of a step, a function of the seed and of the steps up to it."""
+        rng = np.random.default_rng([self.seed, self.before + step])
         views = int(rng.integers(2, min(self.settings.most_views, self.settings.views, self.data.views) + 1))
         return self.data.draw(max(1, self.settings.views // views), views, self.network.config.ticks, rng)
 
@@ -90,7 +92,7 @@ class Training:
             torch.from_numpy(a).to(self.device, non_blocking=True)
             for a in (batch.spikes, batch.rate, batch.points, batch.intrinsics, batch.sensitivity, batch.dark)
         )
-        draws = np.random.default_rng([self.seed, self.step, 1])
+        draws = np.random.default_rng([self.seed, self.before + self.step, 1])
         known = draws.random() >= self.settings.unknown_share
         sensors = Sensors(sensitivity, dark) if draws.random() >= self.settings.raw_share else None
         kind = device_type(self.device)
@@ -164,7 +166,8 @@ def start_from(network: Msdi, path: Path) -> StartWeights:
     own = network.state_dict()
     if {n: t.shape for n, t in state.items()} == {n: t.shape for n, t in own.items()}:
         network.load_state_dict({name: tensor.float() for name, tensor in state.items()})
-        return StartWeights(path.name, sha256_file(path), frozenset(WEIGHTS.read_card(path).trained_on))
+        card = WEIGHTS.read_card(path)
+        return StartWeights(path.name, sha256_file(path), frozenset(card.trained_on), card.steps)
     transfer(network, state, path)
     return StartWeights(path.name, sha256_file(path))
 
@@ -176,6 +179,7 @@ class Run:
         self, training: Training, hidden: list[BurstFile], key: str, out: Path, start: StartWeights | None = None
     ) -> None:
         self.training, self.key, self.out, self.start = training, key, out, start
+        training.before = start.steps if start else 0
         training.resume(self.checkpoint, key)
         earlier = start.shards if start else frozenset[str]()
         self.seen = note_shards(out / "trained_on.json", training.data.files, earlier, fresh=training.step == 0)
@@ -221,7 +225,8 @@ class Run:
         training = self.training
         scores = evaluate(training.network, self.hidden, training.device) if self.hidden else Scores({}, None)
         measured = {name: round(value, 4) for name, value in scores.measured.items()}
-        card = Card(training.network.config.name, training.step, training.seed, self.seen, measured)
+        steps = training.before + training.step
+        card = Card(training.network.config.name, steps, training.seed, self.seen, measured)
         path = self.out / f"msdi-{card.config}.safetensors"
         digest = WEIGHTS.save(path, training.network, card)
         self.scores.add(training.step, scores.measured)

@@ -1,11 +1,13 @@
 """Train the image network on bursts of `make-msdi-data`.
 
 Processes beside the training make the next batches, each a function of (seed, step) alone: a killed training goes on
-with the batches of one that never stopped.
+with the batches of one that never stopped. Steps of weights that begin a training count for its batches and its card,
+not for its schedule. The weights in use are a running mean.
 """
 
 from __future__ import annotations
 
+import copy
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -15,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from spike4dgs.benchmark.environment import available_cores, device_type
@@ -29,6 +32,7 @@ from spike4dgs.method.image_network.training.data import ImageBatch, crop_size, 
 from spike4dgs.method.image_network.weights import WEIGHTS
 from spike4dgs.method.models.network_weights import ConfigCard
 from spike4dgs.method.msdi.records import Curve, note_shards
+from spike4dgs.method.torch_state import follow
 
 ROW_EVERY = 100  # steps between rows of the losses
 _SAVE_EVERY_S = 60.0
@@ -42,13 +46,15 @@ class _Batches(Dataset[ImageBatch]):
     files: Sequence[BurstFile]
     settings: ImageTraining
     seed: int
+    before: int  # steps of the weights that began the training
     first: int
 
     def __len__(self) -> int:
         return self.settings.steps - self.first
 
     def __getitem__(self, index: int) -> ImageBatch:
-        return draw(self.files, self.settings, np.random.default_rng([self.seed, self.first + index]))
+        step = self.before + self.first + index
+        return draw(self.files, self.settings, np.random.default_rng([self.seed, step]))
 
 
 def _alone(worker: int) -> None:
@@ -82,19 +88,26 @@ class ImageNetworkTraining:
         self.files, self.settings, self.device, self.seed = list(files), settings, device, seed
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.network = ImageNetwork(config)
-        self.shards = frozenset[str]()
+            self.live = ImageNetwork(config)
+        self.before, self.shards = 0, frozenset[str]()
         if start:
-            self.shards = frozenset(WEIGHTS.read_card(start).trained_on)
-            WEIGHTS.fill(start, self.network, f"configuration {config.name}").train().requires_grad_(True)
-        self.network.to(device)
-        self.adam = Adam({"all": list(self.network.parameters())}, (0.9, 0.999))
+            card = WEIGHTS.read_card(start)
+            self.before, self.shards = card.steps, frozenset(card.trained_on)
+            WEIGHTS.fill(start, self.live, f"configuration {config.name}").train().requires_grad_(True)
+        self.live.to(device)
+        self.network = copy.deepcopy(self.live)  # of the running mean of the weights: the one to use
+        self.adam = Adam({"all": list(self.live.parameters())}, (0.9, 0.999))
         self.step = 0
+
+    @property
+    def networks(self) -> nn.ModuleDict:
+        """Everything that a checkpoint keeps of the weights."""
+        return nn.ModuleDict({"live": self.live, "mean": self.network})
 
     def batches(self) -> Iterator[ImageBatch]:
         """Yield the batches of this step and all later ones."""
         workers = max(1, available_cores() - 1)
-        data = _Batches(self.files, self.settings, self.seed, self.step)
+        data = _Batches(self.files, self.settings, self.seed, self.before, self.step)
         yield from DataLoader(
             data, batch_size=None, num_workers=workers, prefetch_factor=4, collate_fn=_same, worker_init_fn=_alone
         )
@@ -106,14 +119,15 @@ class ImageNetworkTraining:
         weights = torch.ones_like(truth), moving.to(truth)
         kind = device_type(self.device)
         with torch.autocast(kind, torch.bfloat16, enabled=kind == "cuda"):
-            found = self.network(channels, spikes)
+            found = self.live(channels, spikes)
         losses = torch.stack([log_mse(found, truth, weight) for weight in weights])
         self.adam.zero_grad()
-        asked = losses[:1] if self.network.config.without == MOVING_LOSS else losses
+        asked = losses[:1] if self.live.config.without == MOVING_LOSS else losses
         asked.sum().backward()  # type: ignore[no-untyped-call]
         set_learning_rate(self.adam, self.settings.learning_rate(self.step))
         self.adam.step_clipped()
         self.step += 1
+        follow(self.network, self.live, self.step, self.settings.average)
         with torch.no_grad():
             before = torch.stack([log_mse(channels[:, 0], truth, weight) for weight in weights])
         gained, gained_moving = ((before - losses.detach()) / _PER_DECIBEL).tolist()
@@ -121,7 +135,7 @@ class ImageNetworkTraining:
 
     def save(self, path: Path, key: str) -> None:
         """Write everything needed to go on."""
-        save_training(path, self.step, self.network, self.adam, key)
+        save_training(path, self.step, self.networks, self.adam, key)
 
 
 def _same(batch: Any) -> Any:  # what DataLoader would stack
@@ -136,7 +150,7 @@ def training_key(config: ImageConfig, settings: ImageTraining, seed: int, start:
 def run(training: ImageNetworkTraining, key: str, out: Path) -> None:
     """Train to the last step, with checkpoint, weights, losses and list of shards in `out`."""
     checkpoint, last = out / "checkpoint.safetensors", training.settings.steps
-    training.step = resume_training(checkpoint, training.network, training.adam, key) or 0
+    training.step = resume_training(checkpoint, training.networks, training.adam, key)
     seen = note_shards(out / "trained_on.json", training.files, training.shards, fresh=training.step == 0)
     curve = Curve(out / "losses.csv", training.step)
     recent: list[tuple[float, float]] = []
@@ -144,7 +158,8 @@ def run(training: ImageNetworkTraining, key: str, out: Path) -> None:
     first = training.step
 
     def export() -> None:
-        card = ConfigCard(training.network.config.name, training.step, training.seed, seen)
+        steps = training.before + training.step
+        card = ConfigCard(training.network.config.name, steps, training.seed, seen)
         WEIGHTS.save(out / "images.safetensors", training.network, card)
         curve.write()
 

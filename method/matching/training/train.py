@@ -29,7 +29,7 @@ from spike4dgs.method.matching.training.losses import MatchLosses, match_losses
 from spike4dgs.method.matching.weights import WEIGHTS
 from spike4dgs.method.models.network_weights import ConfigCard
 from spike4dgs.method.msdi.records import Curve, note_shards
-from spike4dgs.method.torch_state import one_torch_thread, seeded
+from spike4dgs.method.torch_state import follow, one_torch_thread, seeded
 
 ROW_EVERY = 50  # steps between rows of the losses
 _SAVE_EVERY_S = 120.0
@@ -94,10 +94,7 @@ class MatchTraining:
         set_learning_rate(self.adam, self.settings.learning_rate(self.step, self.warm_steps))
         self.adam.step_clipped()
         self.step += 1
-        share = min(self.settings.average, self.step / (self.step + 9))  # the first steps are soon forgotten
-        with torch.no_grad():
-            for mean, parameter in zip(self.network.parameters(), live.parameters(), strict=True):
-                mean.lerp_(parameter, 1 - share)
+        follow(self.network, live, self.step, self.settings.average)
         return losses
 
     def save(self, path: Path, key: str) -> None:

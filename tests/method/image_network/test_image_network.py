@@ -284,6 +284,18 @@ def test_a_killed_training_goes_on_with_the_same_bits(tmp_path: Path, files) -> 
     assert WEIGHTS.read_card(tmp_path / "parts" / "images.safetensors") == card
 
 
+def test_the_weights_in_use_are_a_mean_that_follows_those_that_learn(files) -> None:  # type: ignore[no-untyped-def]
+    training = ImageNetworkTraining(files, TINY, SETTINGS, "cpu", 0)
+    steps, batch = [], draw(files, SETTINGS, np.random.default_rng(0))
+    expected = training.live.change.bias.detach().clone()
+    for step in range(1, 4):
+        training.train_step(batch)
+        steps.append(training.live.change.bias.detach().clone())
+        expected += (1 - step / (step + 9)) * (steps[-1] - expected)
+    torch.testing.assert_close(training.network.change.bias.detach(), expected)
+    assert not torch.equal(steps[-1], expected) and min(steps) < expected < max(steps)
+
+
 def test_shards_must_have_room_for_crops_of_one_size(tmp_path: Path, files) -> None:  # type: ignore[no-untyped-def]
     larger = open_bursts(write_toy_shard(tmp_path, 13, width=48, height=32))
     with pytest.raises(UserError, match="expected shards with room for crops of one size, found 32x24, 48x32"):
@@ -300,8 +312,14 @@ def test_a_training_begins_with_given_weights_and_their_shards(tmp_path: Path, f
     training = ImageNetworkTraining(files[1:], TINY, SETTINGS, "cpu", 0, weights)
     same_tensors(training.network.state_dict(), {name: t.float() for name, t in load_file(weights).items()})
     assert training.step == 0 and all(p.requires_grad for p in training.network.parameters())
+    first = {  # of the same shards, without the weights and with them
+        name: next(iter(ImageNetworkTraining(files[1:], TINY, SETTINGS, "cpu", 0, start).batches()))
+        for name, start in (("anew", None), ("on", weights))
+    }
+    assert not torch.equal(first["anew"].truth, first["on"].truth), "it does not see the same batches again"
     run(training, training_key(TINY, SETTINGS, 0, "sha"), tmp_path / "on")
-    assert len(WEIGHTS.read_card(tmp_path / "on" / "images.safetensors").trained_on) == 2
+    card = WEIGHTS.read_card(tmp_path / "on" / "images.safetensors")
+    assert len(card.trained_on) == 2 and card.steps == 12
     assert training_key(TINY, SETTINGS, 0, "sha") != training_key(TINY, SETTINGS, 0)
 
 

@@ -21,7 +21,7 @@ from spike4dgs.method.msdi.evaluate import GROUPS, calibrate, evaluate, tfp
 from spike4dgs.method.msdi.inputs import Sensors
 from spike4dgs.method.msdi.losses import ALPHA
 from spike4dgs.method.msdi.records import Curve, StartWeights, model_card
-from spike4dgs.method.msdi.train import Training, TrainingSettings, checkpoint_key, start_from
+from spike4dgs.method.msdi.train import Run, Training, TrainingSettings, checkpoint_key, start_from
 from spike4dgs.method.msdi.training_data import Batch, Bursts
 from spike4dgs.method.msdi.weights import WEIGHTS, Card, load_network
 
@@ -71,6 +71,14 @@ def test_batches_have_a_steady_number_of_views(data: Bursts) -> None:
         assert samples == 8 // views
         seen.add(views)
     assert seen == set(range(2, 9))
+
+
+def test_a_training_that_weights_began_does_not_see_their_batches_again(data: Bursts, tmp_path: Path) -> None:
+    training = Training(data, TINY, FAST, "cpu", seed=0)
+    first, fourth = training.batch(0), training.batch(3)
+    Run(training, [], "key", tmp_path, StartWeights("earlier.safetensors", "2345", steps=3))
+    np.testing.assert_array_equal(training.batch(0).rate, fourth.rate)
+    assert first.rate.shape != fourth.rate.shape or not np.array_equal(first.rate, fourth.rate)
 
 
 def test_a_step_without_a_finite_gradient_changes_nothing(data: Bursts, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,9 +224,10 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
     begun = {**arguments, "data": tmp_path / "more", "out": tmp_path / "begun", "start": path}
     assert train_msdi(**begun) == 0  # type: ignore[arg-type]
     text = (tmp_path / "begun/README.md").read_text()
-    assert f"`{path.name}`, sha256 `{sha256_file(path)}`" in text
+    assert f"`{path.name}` of step 3, sha256 `{sha256_file(path)}`" in text
     assert "Measured" not in text and "calibration.png" not in text, "without hidden shards there are no scores"
     assert not (tmp_path / "begun/calibration.png").exists() and "\n\n## Training\n\n- Data" in text
+    assert "Weights of step 6," in text and "- 3 steps of 4 views" in text
     seen = WEIGHTS.read_card(tmp_path / "begun/msdi-tiny.safetensors").trained_on
     assert set(seen) > set(card.trained_on) and any(name.startswith("toy-15@") for name in seen)
 
