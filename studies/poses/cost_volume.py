@@ -28,8 +28,8 @@ class CellDepths:
 
 
 @torch.inference_mode()
-def cell_depths(fine: Tensor, size: tuple[int, int], array: Array, view: int, planes: Float64) -> CellDepths:
-    """Return the depths of a view's cells, by `planes` [D], rising.
+def cell_scores(fine: Tensor, size: tuple[int, int], array: Array, view: int, planes: Float64) -> Float32:
+    """Return the scores [D, h, w] of a view's cells on `planes` [D], rising; -inf where fewer than two views see them.
 
     `fine` [V, F, h, w] are features, in cells of FINE px, of images of `size` (H, W) px: cells beyond are padding.
     """
@@ -54,10 +54,11 @@ def cell_depths(fine: Tensor, size: tuple[int, int], array: Array, view: int, pl
             total += (own * functional.normalize(there, dim=0)).sum(dim=0) * inside
             seen += inside
         scores[k] = torch.where(seen >= min(2, len(others)), total / seen.clamp(min=1), -torch.inf)
-    return _best(scores.numpy(), planes, (rows, columns))
+    return np.asarray(scores.reshape(-1, rows, columns).numpy())
 
 
-def _best(scores: Float32, planes: Float64, size: tuple[int, int]) -> CellDepths:
+def best_depths(scores: Float32, planes: Float64) -> CellDepths:
+    """Return the depths of the best planes by scores [D, h, w]."""
     known = np.isfinite(scores)
     seen = known.any(axis=0)
     lowest = np.where(known, scores, np.inf).min(axis=0)
@@ -70,4 +71,4 @@ def _best(scores: Float32, planes: Float64, size: tuple[int, int]) -> CellDepths
     place = np.where(inner == best, inner + shift, best)
     confidence = np.where(seen, filled.max(axis=0).clip(0, 1), 0)
     inverse = planes[0] + place * (planes[1] - planes[0])
-    return CellDepths(inverse.reshape(size).astype(np.float32), confidence.reshape(size).astype(np.float32))
+    return CellDepths(inverse.astype(np.float32), confidence.astype(np.float32))

@@ -5,7 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from spike4dgs.method.matching.adjust import Array
-from spike4dgs.studies.poses.cost_volume import cell_depths
+from spike4dgs.studies.poses.cost_volume import CellDepths, best_depths, cell_scores
 
 ROWS, COLUMNS, CHANNELS = 30, 40, 24
 SIZE = (60, 80)  # px of the images: no cell is padding
@@ -35,6 +35,10 @@ def features(array: Array) -> torch.Tensor:
     return torch.from_numpy(np.stack(found)).float()
 
 
+def cell_depths(fine: torch.Tensor, size: tuple[int, int], array: Array, planes: np.ndarray) -> CellDepths:
+    return best_depths(cell_scores(fine, size, array, 0, planes), planes)
+
+
 def test_a_planes_depth_is_found_and_what_is_sure_is_right() -> None:
     K = np.array([[70.0, 0, 40], [0, 70.0, 30], [0, 0, 1]])
     turns = Rotation.from_rotvec([(0, 0, 0), (0, -0.05, 0.02), (0.05, 0, 0), (0.0, 0.06, 0)]).as_matrix()
@@ -42,13 +46,13 @@ def test_a_planes_depth_is_found_and_what_is_sure_is_right() -> None:
     array = Array(turns, centers, np.tile(K, (4, 1, 1)))
     true = true_inverse(array, 0)
     planes = np.linspace(0.85 * true.min(), 1.15 * true.max(), 48)
-    found = cell_depths(features(array), SIZE, array, 0, planes)
+    found = cell_depths(features(array), SIZE, array, planes)
     inside = (slice(6, -6), slice(6, -6))
     off = np.abs(found.inverse / true - 1)
     assert np.median(off[inside]) < 0.01 and np.mean(off[inside] < 0.03) > 0.9
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
     # Features that tell nothing are less sure, cell by cell, than those of the plane.
-    noise = cell_depths(torch.randn(4, CHANNELS, ROWS, COLUMNS), SIZE, array, 0, planes)
+    noise = cell_depths(torch.randn(4, CHANNELS, ROWS, COLUMNS), SIZE, array, planes)
     assert np.median(noise.confidence) < 0.6 * np.median(found.confidence[inside])
 
 
@@ -56,7 +60,7 @@ def test_what_one_view_alone_sees_has_no_confidence() -> None:
     K = np.array([[70.0, 0, 40], [0, 70.0, 30], [0, 0, 1]])
     away = Rotation.from_rotvec([(0, 0, 0), (0, 3.0, 0), (0, 3.0, 0)]).as_matrix()
     array = Array(away, np.array([(0, 0, 0), (0.5, 0, 0), (0, 0.5, 0)]), np.tile(K, (3, 1, 1)))
-    found = cell_depths(torch.randn(3, 4, ROWS, COLUMNS), SIZE, array, 0, np.linspace(0.1, 0.5, 8))
+    found = cell_depths(torch.randn(3, 4, ROWS, COLUMNS), SIZE, array, np.linspace(0.1, 0.5, 8))
     assert (found.confidence == 0).all()
 
 
@@ -66,7 +70,7 @@ def test_padding_beyond_the_image_sees_nothing() -> None:
     centers = np.array([(0, 0, 0), (-0.1, 0, 0), (-0.1, 0, 0)])
     array = Array(np.tile(np.eye(3), (3, 1, 1)), centers, np.tile(K, (3, 1, 1)))
     fine, planes = torch.ones(3, 4, ROWS, COLUMNS), np.array([0.8, 1.0, 1.2])
-    whole, cut = (cell_depths(fine, size, array, 0, planes).confidence for size in (SIZE, (60, 70)))
+    whole, cut = (cell_depths(fine, size, array, planes).confidence for size in (SIZE, (60, 70)))
     seen = np.arange(COLUMNS) * 2 + 1 + 0.8 * 0.1 * 70
     np.testing.assert_array_equal(whole > 0, np.tile(seen < 80, (ROWS, 1)))
     np.testing.assert_array_equal(cut > 0, np.tile(seen < 70, (ROWS, 1)))

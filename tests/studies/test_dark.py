@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_scenes import HEIGHT, WIDTH, write_small_scene
 from toy_bursts import write_toy_shard
 from toy_world import ToyWorld
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.metrics.pose_error import Sim3
+from spike4dgs.benchmark.scene.images import write_geometry
+from spike4dgs.benchmark.scene.manifest import write_manifest
 from spike4dgs.benchmark.scene.training_bursts import open_folder
 from spike4dgs.studies.poses import dark, points
 from spike4dgs.studies.poses.dark import ESTIMATORS, dark_poses, errors_of, see
@@ -98,14 +101,16 @@ def test_errors_are_relative_to_the_distance_and_ranked_by_sureness() -> None:
     assert points.errors_of((inverse, np.array([[0.1, 0.5, 0.9, 0.0]], np.float32)), true)["rank"] == -1
 
 
-def test_both_finders_see_a_bright_world(shards: Path) -> None:
+def test_all_finders_see_a_bright_world(shards: Path) -> None:
     (file,) = (f for f in open_folder(shards) if f.facts.hidden)
     burst = file.read(2)
     sight = see(burst, file, 1.0, 401, np.random.default_rng(0))
-    for find in points.FINDERS.values():
-        inverse, sure = find(sight)
+    errors = []
+    for find in points.SCENE_FINDERS.values():
+        inverse, sure = find(sight.cameras, sight.inputs)
         assert inverse.shape == sure.shape == (61, 96)
-        assert points.errors_of((inverse, sure), burst.depth[0].astype(np.float64))["error"] < 0.05
+        errors.append(points.errors_of((inverse, sure), burst.depth[0].astype(np.float64))["error"])
+    assert max(errors) < 0.05 and errors[2] < errors[0], "both scores together are better than the cells' alone"
 
 
 def test_the_table_of_points_has_a_line_for_each_condition(shards: Path, tmp_path: Path, monkeypatch) -> None:
@@ -118,6 +123,21 @@ def test_the_table_of_points_has_a_line_for_each_condition(shards: Path, tmp_pat
     ]
     _, _, bright, dim = (tmp_path / "out" / "points.md").read_text().splitlines()
     assert bright.startswith(f"| 1 | 2 | {rows[0]['error']:.1%} |") and dim.startswith("| 1/4 | 2 |")
+
+
+def test_the_table_of_scenes_has_a_line_for_each(tmp_path: Path) -> None:
+    scene = write_small_scene(tmp_path / "scene")
+    with pytest.raises(UserError, match="geometry/cam_00/000040.exr"):
+        points.dark_points(scenes=(scene,), out=tmp_path)
+    depth, none = np.full((HEIGHT, WIDTH), 3.0, np.float32), np.zeros((HEIGHT, WIDTH), np.uint32)
+    depth[:, :4] = np.inf
+    write_geometry(scene / "geometry/cam_00/000040.exr", depth, none, np.zeros((*depth.shape, 2), np.float32), 2000.0)
+    write_manifest(scene)
+    assert points.dark_points(scenes=(scene,), out=tmp_path) == 0
+    rows = json.loads((tmp_path / "scenes.json").read_text())["rows"]
+    assert [(row["scene"], row["points"]) for row in rows] == [("pattern-0", name) for name in points.SCENE_FINDERS]
+    assert all(row["error"] > 0 and 0 < row["px"] < 30 for row in rows)
+    assert (tmp_path / "scenes.md").read_text().splitlines()[2].startswith(f"| pattern-0 | {rows[0]['error']:.1%} |")
 
 
 def test_a_folder_without_hidden_arrays_at_rest_is_refused(tmp_path: Path) -> None:
