@@ -17,7 +17,8 @@ MEASUREMENTS: dict[str, Command] = {
     ),
     "report dark-points": Command(
         "spike4dgs.cli.studies:dark_points",
-        "find points in less and less light at true poses, with the matching network's cost volume and the plane sweep",
+        "find points in less and less light, or of scenes, at true poses, with the matching network's cost volume and "
+        "the plane sweep",
         "report dark-points data/matching --out runs/dark-points",
     ),
     "report hard-cases": Command(

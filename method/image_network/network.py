@@ -1,6 +1,7 @@
 """The image network: a U-Net that adds to the root of `adaptive`'s image what it learnt; at first nothing.
 
-The root of a rate has the same shot noise in the dark and in the light, and is near to what eyes and the metrics see.
+The root of a rate has the same shot noise in the dark and in the light, and is near to what eyes see. The metrics are
+of linear radiance, in which errors in the dark count for less.
 """
 
 from __future__ import annotations
