@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.environment import choose_device
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.plugins import Plugin, find_plugins
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -194,16 +194,16 @@ def find_packaged_methods() -> dict[str, Plugin]:
     return find_plugins(GROUP, "method", lambda name, method, source: check_protocol(method, source))
 
 
-def get_method(name: str, methods: Mapping[str, Method] | None = None) -> Method:
+def get_method(name: str, methods: Mapping[str, Method] | None = None, where: str = "--methods") -> Method:
     """Return the method called `name`; NAME[PART.SETTING=VALUE,...] is one with other settings.
 
-    `methods` are those to look among; all that are installed if left out. Raises UserError that lists the known names,
-    and for settings that the method does not have.
+    `methods` are those to look among; all that are installed if left out. Raises UserError that says `where` the name
+    is given and what are near it, and for settings that the method does not have.
     """
     known = find_methods() if methods is None else methods
     plain, bracket, inside = name.partition("[")
     if plain not in known:
-        raise problem("method", f"one of {', '.join(sorted(known))}", repr(plain), "see `spike4dgs methods`")
+        raise unknown(where, plain, sorted(known), "`spike4dgs methods`")
     return with_settings(known[plain], inside.removesuffix("]").split(",")) if bracket else known[plain]
 
 
@@ -217,7 +217,7 @@ def with_settings(method: Method, settings: Sequence[str]) -> Method:
     for text in settings:
         name, equals, value = text.partition("=")
         if not equals or not re.fullmatch(r"[A-Za-z0-9+._-]+", value):
-            raise problem("--set", "PART.NAME=VALUE, such as motion.lr_grid=0.005", repr(text), "correct it")
+            raise problem("--set", "PART.NAME=VALUE, such as trainer.lr_means=0.0002", repr(text), "correct it")
         try:
             overrides[name] = parse_json(value)
         except ValueError:

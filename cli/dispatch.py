@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import importlib
 import inspect
@@ -18,7 +17,7 @@ from importlib.metadata import version
 from types import MappingProxyType
 from typing import Any, get_args, get_type_hints
 
-from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.errors import UserError, problem, unknown
 from spike4dgs.cli.command import Command
 from spike4dgs.cli.commands import COMMANDS, GROUPS
 
@@ -172,9 +171,7 @@ def _numbers(option: str, value: Any) -> Iterator[tuple[str, float]]:
 
 def _find(name: str, table: Mapping[str, Command], prog: str) -> Command:
     if name not in table:
-        near = difflib.get_close_matches(name, table, 1)
-        fix = f"did you mean `{prog} {near[0]}`?" if near else f"see `{prog} --help`"
-        raise problem(prog, f"one of {', '.join(table)}", repr(name), fix)
+        raise unknown(prog, name, table, f"`{prog} --help`")
     return table[name]
 
 

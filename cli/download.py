@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.release.scenes import WORKERS, check_revisions, open_release
 from spike4dgs.benchmark.release.scenes import download as fetch_scenes
 from spike4dgs.benchmark.release.selection import EVERYTHING, Selection
@@ -46,8 +46,8 @@ def download(
     revisions = None if track == ALL else track_scenes(track)
     release = open_release(found, sha256)
     if revisions is not None:
-        if unknown := [s for s in selection.scenes if s not in revisions]:
-            raise problem("--scenes", f"scenes of {track}: {', '.join(revisions)}", unknown[0], "correct the name")
+        if others := [s for s in selection.scenes if s not in revisions]:
+            raise unknown(f"--scenes of {track}", others[0], revisions)
         revisions = {s: r for s, r in revisions.items() if not selection.scenes or s in selection.scenes}
         check_revisions(found, release, revisions)
     chosen = selection if revisions is None else replace(selection, scenes=tuple(revisions))

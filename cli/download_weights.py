@@ -14,7 +14,7 @@ from spike4dgs.benchmark.files import sha256_file
 from spike4dgs.benchmark.release.source import Source
 from spike4dgs.benchmark.release.weights import fetch_weights
 from spike4dgs.benchmark.weights import ALEXNET, METAIQA, SQUEEZENET, VGG16, WeightFile
-from spike4dgs.cli.options import From
+from spike4dgs.cli.options import From, check_names
 
 OTHERS = {"lpips-vgg": VGG16, "lpips-squeeze": SQUEEZENET, "metaiqa": METAIQA, "dust3r": DUST3R}
 FILES = {"lpips": ALEXNET, **OTHERS, **PUBLISHED}
@@ -31,8 +31,7 @@ def download_weights(names: Positional[tuple[str, ...]] = (), *, source: From = 
         source: Another folder to fetch the files from, such as a mirror: https://..., file://... or a path.
         yes: Accept the licences without being asked.
     """
-    if unknown := [name for name in names if name not in FILES]:
-        raise problem("weights", f"names among {', '.join(FILES)}", unknown[0], "correct the name")
+    check_names("weights", names, FILES)
     chosen = {name: FILES[name] for name in names or FILES}
     for name, file in chosen.items():
         print(_facts(name, file))

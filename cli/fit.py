@@ -47,7 +47,7 @@ def fit(
         poses: auto (given poses are adjusted if matched features show that they are wrong) or given.
         clocks: auto (the cameras' clocks are estimated from the moving parts, and used if they differ) or given.
     """
-    wanted = with_settings(get_method(method), settings)
+    wanted = with_settings(get_method(method, where="--method"), settings)
     request = FitRequest(make_budget(budget), choose_device_for([wanted], compute.device), compute.seed)
     fit_recording(scene, wanted, out, request, TFP, poses=poses, clocks=clocks)
     return 0

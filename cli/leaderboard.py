@@ -12,7 +12,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import unknown
 from spike4dgs.benchmark.metrics.measure import mean
 from spike4dgs.benchmark.metrics.table import METRICS, PRIMARY
 from spike4dgs.benchmark.reports.console import make_console
@@ -45,7 +45,7 @@ def show(
         leaderboard: Leaderboard folder; ./leaderboard if left out, where it has entries.
     """
     if metric not in METRICS:
-        raise problem("--metric", f"one of {', '.join(METRICS)}", repr(metric), "correct the name")
+        raise unknown("--metric", metric, METRICS, "docs/metrics.md")
     folder, console = reading_folder(leaderboard), make_console()
     boards, refused = gather(folder, runs, published=True, brief=metric == PRIMARY and not runs)
     if folder == SHIPPED:

@@ -30,7 +30,7 @@ def methods(name: Positional[str | None] = None) -> int:
     """
     console = make_console()
     if name is not None:
-        _describe(console, get_method(name))
+        _describe(console, get_method(name, where="NAME"))
         return 0
     package = None
     headings = (part.replace("initialization", "initial-\nization") for part in _PARTS)  # names fit 80 characters

@@ -11,7 +11,7 @@ import numpy as np
 from tyro.conf import arg
 
 from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import unknown
 from spike4dgs.benchmark.spikes.image_size import size_doubt
 from spike4dgs.benchmark.spikes.sensor_model import gathered
 from spike4dgs.benchmark.spikes.stream import SpikeStream
@@ -74,5 +74,5 @@ def white_of(rates: Sequence[Float64], streams: Sequence[SpikeStream]) -> float:
 def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None:
     """Raise UserError for a name that is not among the known ones."""
     listed = list(known)
-    if unknown := [name for name in names if name not in listed]:
-        raise problem(option, f"one of {', '.join(listed)}", repr(unknown[0]), "correct the name")
+    if others := [name for name in names if name not in listed]:
+        raise unknown(option, others[0], listed)

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 from rich.console import Console
 from rich.progress import Progress
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.files import read_json, write_json
 from spike4dgs.benchmark.runs.executors import Run, executor, here
 from spike4dgs.benchmark.scene.cameras import check_lens
@@ -75,9 +75,9 @@ class SceneSettings:
         from spike4dgs.generators.worlds import WORLDS  # it loads other packages' worlds
 
         if world not in WORLDS:
-            raise problem("world", f"one of {', '.join(WORLDS)}", repr(world), "correct the name")
+            raise unknown("world", world, WORLDS)
         if self.profile not in PROFILES:
-            raise problem("--profile", f"one of {', '.join(PROFILES)}", repr(self.profile), "correct the name")
+            raise unknown("--profile", self.profile, PROFILES)
         if self.seed < 0 or self.variant < 0:
             raise problem("--seed and --variant", "numbers from 0 up", f"{self.seed}, {self.variant}", "correct them")
         profile = (PROFILES if self.rendering == "paths" else SPLIT_PROFILES)[self.profile]
@@ -116,7 +116,7 @@ def track_jobs(track: str, worlds: Sequence[str], settings: SceneSettings) -> li
     Raises UserError for an unknown track, and for settings that are the track's.
     """
     if track not in TRACKS:
-        raise problem("--track", f"one of {', '.join(TRACKS)}", repr(track), "correct the name")
+        raise unknown("--track", track, TRACKS)
     if settings != SceneSettings():
         fix = "leave one out"
         raise problem("--track", "a track, which has its own profile, variants and camera", "settings too", fix)

@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import chain
 from typing import Any, Self, TypeVar
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.method import Budget
 
 
@@ -48,23 +49,22 @@ def override(parts: SettingsByPart, overrides: Mapping[str, Any], where: str) ->
     Raises UserError for an unknown part or name, or a value of another type.
     """
     changes: dict[str, dict[str, Any]] = {part: {} for part in parts}
+    known = {part: sorted(f"{part}.{f.name}" for f in fields(settings)) for part, settings in parts.items()}
     for dotted, value in overrides.items():
         part, _, name = dotted.partition(".")
-        if part not in parts or not name:
-            expected = f"settings named PART.NAME, PART among {', '.join(sorted(parts))}"
-            raise problem(where, expected, repr(dotted), "correct the name")
+        if dotted not in known.get(part, ()):
+            near = known.get(part) or chain.from_iterable(known.values())
+            raise unknown(where, dotted, near, "`spike4dgs methods NAME`")
         changes[part][name] = value
     return {part: make_settings(changes[part], where, settings, f"{part}.") for part, settings in parts.items()}
 
 
 def make_settings(overrides: Mapping[str, Any], where: str, defaults: S, prefix: str = "") -> S:
     """Return settings with `overrides` by name. Raises UserError for an unknown name or a value of another type."""
-    known = {f.name for f in fields(defaults)}
+    known = sorted(f.name for f in fields(defaults))
     for name, value in overrides.items():
         if name not in known:
-            listed = f"settings among {', '.join(prefix + n for n in sorted(known))}" if known else "no settings"
-            expected = listed if known or not prefix else f"{listed} of {prefix.rstrip('.')}"
-            raise problem(where, expected, repr(prefix + name), "correct the name")
+            raise unknown(where, prefix + name, [prefix + n for n in known])
         kind = type(getattr(defaults, name))
         if isinstance(value, bool) != (kind is bool) or not isinstance(value, (int, float) if kind is float else kind):
             raise problem(where, f"{prefix}{name} as {kind.__name__}", repr(value), "correct the value")

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from spike4dgs.baselines.recipes import PARTS
 from spike4dgs.benchmark.arrays import Float32
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import unknown
 from spike4dgs.benchmark.method import FitRequest, Method, Model, find_methods
 from spike4dgs.benchmark.scene.calibration import Calibration
 from spike4dgs.benchmark.scene.scene import TrainingScene
@@ -156,7 +156,7 @@ def _recipe_method(name: str) -> RecipeMethod:
         and method.recipe.motion not in PARTS.algorithms
     }
     if name not in known:
-        raise problem("--methods", f"methods among {', '.join(sorted(known))}", repr(name), "name one of them")
+        raise unknown("--methods", name, sorted(known))
     return known[name]
 
 

@@ -10,7 +10,7 @@ from spike4dgs.baselines.images.tfi import TFI
 from spike4dgs.baselines.images.tfp import TFP
 from spike4dgs.baselines.images.tfstp import TFSTP
 from spike4dgs.benchmark.arrays import Float32
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import unknown
 from spike4dgs.benchmark.screen.shown import Table
 from spike4dgs.benchmark.spikes.stream import SpikeStream
 from spike4dgs.method.image_network.maker import MSDI
@@ -29,7 +29,7 @@ def make_image(name: str, stream: SpikeStream, tick: int, gain: float) -> Float3
     Raises UserError for an unknown name and for a tick outside the clip.
     """
     if name not in IMAGES:
-        raise problem("image maker", f"one of {', '.join(IMAGES)}", repr(name), "correct the name")
+        raise unknown("image maker", name, IMAGES)
     return np.asarray(IMAGES[name](stream, [tick], gain)[0])
 
 

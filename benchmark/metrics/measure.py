@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Mask
-from spike4dgs.benchmark.errors import UserError, problem
+from spike4dgs.benchmark.errors import UserError, unknown
 from spike4dgs.benchmark.metrics.image_pair import Image, ImagePair, check_images
 from spike4dgs.benchmark.metrics.metric import MAX_PSNR_DB, Images, Metric
 from spike4dgs.benchmark.metrics.table import METRICS
@@ -55,8 +55,8 @@ def select_metrics(names: Sequence[str] = (AUTO,)) -> Selection:
     The metrics of linear images are always computed: they need nothing and the ranks rest on them. Raises UserError for
     unknown names, and WeightsError where a metric that is named lacks its weights.
     """
-    if unknown := [n for n in names if n not in METRICS and n != AUTO]:
-        raise problem("--metrics", f"{AUTO} or ids among {', '.join(METRICS)}", ", ".join(unknown), "correct the ids")
+    if others := [n for n in names if n not in METRICS and n != AUTO]:
+        raise unknown("--metrics", others[0], (AUTO, *METRICS), "docs/metrics.md")
     weights: dict[str, str | None] = {}
     absent: dict[str, str] = {}
     for m in METRICS.values():

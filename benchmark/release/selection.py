@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.release.index import DESCRIPTION, Member, Release, Sample, SceneEntry, part_of
 from spike4dgs.benchmark.spikes.stream import bytes_per_tick
 
@@ -93,5 +93,5 @@ EVERYTHING = Selection()
 
 def _check(option: str, asked: Sequence[str], known: Iterable[str], release: str) -> None:
     names = sorted(known)
-    if unknown := [name for name in asked if name not in names]:
-        raise problem(option, f"names among {', '.join(names)} (release {release})", unknown[0], "correct the name")
+    if others := [name for name in asked if name not in names]:
+        raise unknown(f"{option} of release {release}", others[0], names)

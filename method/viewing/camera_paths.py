@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from spike4dgs.benchmark.arrays import Float64
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.scene.cameras import Camera, look_at
 from spike4dgs.benchmark.scene.lens import NAMES, make_distortion
 
@@ -129,7 +129,7 @@ def fixed(cameras: Sequence[Camera], name: str | None = None) -> Path:
     elif name in known:
         chosen = known[name]
     else:
-        raise problem("--camera", f"one of {', '.join(known)}", repr(name), "name one of them")
+        raise unknown("--camera", name, known)
     return lambda s: chosen
 
 

@@ -180,7 +180,9 @@ def test_a_recipe_overrides_the_numbers_of_its_image_maker(scene: Scene) -> None
     camera, t_us = scene.cameras["cam_03"], 2000.0
     default = METHODS["tfp+static"].fit(scene.training, FitRequest(TINY)).render(camera, t_us)
     assert not np.array_equal(wide.fit(scene.training, FitRequest(TINY)).render(camera, t_us), default)
-    with pytest.raises(UserError, match="settings among image_maker.half_window, found 'image_maker.window'"):
+    with pytest.raises(
+        UserError, match="one of image_maker.half_window, found 'image_maker.window'; did you mean 'image_maker.half"
+    ):
         RecipeMethod(dataclasses.replace(recipe, settings={"image_maker.window": 30}), PARTS)
 
 

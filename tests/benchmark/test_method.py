@@ -10,6 +10,7 @@ from dummy_methods import CountMethod, run
 
 from spike4dgs.benchmark import UserError, open_scene, plugins
 from spike4dgs.benchmark import method as recipes
+from spike4dgs.benchmark.errors import unknown
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.runs.cell import Job
 from spike4dgs.benchmark.runs.predictions import read_info
@@ -73,3 +74,21 @@ def test_what_a_method_is_given_is_recorded_and_no_part_of_the_key(small_scene: 
     (record,) = run(tmp_path, [small_scene], Unflat())
     assert record["method"]["given"] == ["poses"]
     assert read_info(tmp_path / "predictions/counts/pattern-0").method.given == ("poses",)
+
+
+def test_a_mistyped_name_gets_the_nearest_and_no_long_list() -> None:
+    known = {f"method-{k}": CountMethod() for k in range(40)}
+    with pytest.raises(UserError) as error:
+        recipes.get_method("metohd-7", known, "--method")
+    text = str(error.value)
+    assert text.startswith("--method: expected a name that `spike4dgs methods` lists, such as method-7, ")
+    assert text.endswith("found 'metohd-7'; did you mean 'method-7'?") and len(text) < 160
+    with pytest.raises(UserError, match="--methods: expected one of a, b, found 'xyz'; correct the name"):
+        recipes.get_method("xyz", {"b": CountMethod(), "a": CountMethod()})
+
+
+def test_the_part_that_all_settings_share_makes_none_of_them_nearer() -> None:
+    with pytest.raises(UserError, match="found 'motion.focal'; correct the name"):
+        raise unknown("here", "motion.focal", ["motion.lr_grid", "motion.cell_px"])
+    with pytest.raises(UserError, match=r"did you mean 'motion.lr_grid'\?"):
+        raise unknown("here", "motion.lr_gird", ["motion.lr_grid", "motion.cell_px"])

@@ -109,7 +109,7 @@ def test_a_file_without_a_fixed_hash(server: Path, hub: Path, capsys: pytest.Cap
 
 
 def test_errors_are_one_line(server: Path) -> None:
-    with pytest.raises(UserError, match="weights: expected names among lpips, lpips-vgg, .*, found vgg"):
+    with pytest.raises(UserError, match="weights: expected one of lpips, lpips-vgg, .*, found 'vgg'"):
         command("vgg")
     with pytest.raises(UserError, match="weights metaiqa: expected an address of the file, found a page"):
         command("metaiqa", yes=True)

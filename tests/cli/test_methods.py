@@ -81,8 +81,8 @@ def test_a_method_with_other_settings_has_them_in_its_name_and_parameters() -> N
 @pytest.mark.parametrize(
     ("method", "setting", "message"),
     [
-        ("tfp+4dgs", "motion.lr_grids=1", "expected settings among motion.*found 'motion.lr_grids'"),
-        ("tfp+4dgs", "lr_grid=1", "expected settings named PART.NAME"),
+        ("tfp+4dgs", "motion.lr_grids=1", "found 'motion.lr_grids'; did you mean 'motion.lr_grid'"),
+        ("tfp+4dgs", "lr_grid=1", "found 'lr_grid'; did you mean 'motion.lr_grid'"),
         ("tfp+4dgs", "motion.lr_grid", "--set: expected PART.NAME=VALUE"),
         ("tfp+4dgs", "motion.lr_grid=many", "expected motion.lr_grid as float, found 'many'"),
         ("tfp+4dgs", "motion.lr_grid=NaN", "expected motion.lr_grid as float, found 'NaN'"),

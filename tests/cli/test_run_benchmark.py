@@ -271,7 +271,10 @@ def test_another_record_in_a_shared_leaderboard_needs_replace(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"methods": ("nonsense",)}, "method: expected one of bad, counts, plays-back, quick+counts, found 'nonsense'"),
+        (
+            {"methods": ("nonsense",)},
+            "--methods: expected one of bad, counts, plays-back, quick+counts, found 'nonsense'",
+        ),
         ({"budget": "0"}, "--budget: expected quick, standard, paper, or a positive number, 1e+06 at most, found '0'"),
         ({"budget": "nan"}, "or a positive number, 1e+06 at most, found 'nan'"),
         ({"budget": "fast"}, "or a positive number, 1e+06 at most, found 'fast'"),

@@ -257,14 +257,13 @@ def test_an_unknown_setting_a_wrong_type_or_number_is_refused_where_it_is_given(
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("motion.lr_gird", "expected settings among motion.cell_px, .*motion.tv_weight, found 'motion.lr_gird'"),
-        ("density.refine", "settings among density.grow_grad2d, density.grow_scale3d, .* found 'density.refine'"),
-        ("lr_grid", "PART.NAME, PART among density, images, initialization, motion, supervision, trainer, found 'lr_g"),
-        ("optimizer.lr", "PART among density, .*, found 'optimizer.lr'; correct the name"),
-        ("initialization.seed", "expected no settings of initialization, found 'initialization.seed'"),
+        ("motion.lr_gird", "found 'motion.lr_gird'; did you mean 'motion.lr_grid'?"),
+        ("density.refine", "one of density.grow_grad2d, .*, found 'density.refine'; did you mean 'density.refine_"),
+        ("lr_grid", "found 'lr_grid'; did you mean 'motion.lr_grid'?"),
+        ("nowhere.xyz", "a name that `spike4dgs methods NAME` lists, found 'nowhere.xyz'; correct the name"),
     ],
 )
-def test_an_unknown_name_lists_the_parts_names_and_an_unknown_part_the_parts(name, message):
+def test_an_unknown_setting_names_the_nearest_and_where_all_are_listed(name, message):
     with pytest.raises(UserError, match=f"recipe test: .*{message}"):
         method("hexplane", {name: 1.0})
 

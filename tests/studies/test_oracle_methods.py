@@ -207,7 +207,7 @@ def test_recipes_without_velocities_or_background_have_a_ladder_too(root: Path) 
 
 @pytest.mark.parametrize("name", ["nearest-view", "dy-spikenerf", "tfp+d3dgs", "spike4dgs-x+colmap", "nothing"])
 def test_what_is_no_recipe_of_the_trainer_with_given_poses_has_no_ladder(root: Path, name: str) -> None:
-    with pytest.raises(UserError, match="--methods: expected methods among .*spike4dgs-x"):
+    with pytest.raises(UserError, match="--methods: expected one of .*spike4dgs-x"):
         oracle_ladders((name,), root, SAMPLES)
 
 

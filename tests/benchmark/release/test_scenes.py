@@ -300,9 +300,9 @@ class TestSelection:
 
     def test_what_the_release_has_not(self, release_folder: Path, tmp_path: Path) -> None:
         for chosen, words in (
-            (Selection(("car",)), "--scenes: expected names among pattern-0, pattern-1"),
-            (Selection((), ("cam_77",)), "--cameras: expected names among cam_00"),
-            (Selection((), (), ("sound",)), "--parts: expected names among calibration, description, images"),
+            (Selection(("car",)), "--scenes of release .*: expected one of pattern-0, pattern-1"),
+            (Selection((), ("cam_77",)), "--cameras of release .*: expected one of cam_00"),
+            (Selection((), (), ("sound",)), "--parts of release .*: expected one of calibration, description, images"),
             (Selection((), (), (), (1000.0, 1001.0)), "--window-ms: expected milliseconds from 0 to 1000"),
             (Selection((), (), ("spikes",), (0.0, 1.0)), "--window-ms: expected no --parts beside it"),
         ):

@@ -228,7 +228,7 @@ def test_a_worker_with_other_inputs_is_one_error_that_names_it(order: Order, tmp
         ({"scene": damaged, "revision": open_scene(damaged).revision}, f"damaged on {worker}.*truncated"),
         ({"key": "0" * 64}, f"{worker}.*another version of it or of spike4dgs; install the same there"),
         ({"method": b"cno_such_package\nMethod\n."}, f"{worker}.*No module named 'no_such_package'"),
-        ({"method": "no-such-method"}, f"{worker}.*: method: expected one of .*found 'no-such-method'"),
+        ({"method": "no-such-method"}, f"{worker}.*: --methods: expected a name .*found 'no-such-method'"),
         ({"device": "cuda:99"}, f"{worker}.*: --device: expected a CUDA device"),
     ):
         with pytest.raises(UserError, match=message):
