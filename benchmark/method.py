@@ -124,7 +124,7 @@ class Model(Protocol):
     writes it (`provenance.Savable`): a run keeps the models that it can save."""
 
     def render(self, camera: Camera, t_us: float) -> NDArray[np.float32]:
-        """Return gray linear radiance [H, W] float32 (1.0 = white) seen by `camera` at the time `t_us`."""
+        """Return gray linear radiance [camera.height, camera.width] float32, 1.0 = white, at the time `t_us`."""
         ...
 
 

@@ -200,11 +200,12 @@ def _write_video(path: Path, saved: SavedModel) -> float:
     slow_motion = VIDEO_S * 1e6 / about.duration_us
     first = resized(view(0.0), SCALE)
     start = time.perf_counter()
-    saved.model.render(first, 0.0)
+    image = saved.model.render(first, 0.0)
     fps = FPS if time.perf_counter() - start < SLOW_FRAME_S else SLOW_FPS
-    with video_writer(path, (first.width, first.height), fps, gray=True) as write:
-        for image in render_frames(saved, view, frame_times(about.duration_us, slow_motion, fps), SCALE):
-            write(image)
+    height, width = (n // 2 * 2 for n in image.shape)  # of `first`, or the model's own where it follows no camera's
+    with video_writer(path, (width, height), fps, gray=True) as write:
+        for frame in render_frames(saved, view, frame_times(about.duration_us, slow_motion, fps), SCALE):
+            write(frame[:height, :width])
     return slow_motion
 
 

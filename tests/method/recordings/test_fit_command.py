@@ -129,6 +129,16 @@ def test_a_fit_leaves_a_model_a_sheet_a_video_and_a_report(fitted: Path) -> None
     assert ok and frame.shape == (120, 192, 3) and frame.std() > 10
 
 
+def test_a_model_of_one_size_gets_a_video_of_that_size(tmp_path: Path) -> None:
+    """The nearest view's image is that of its camera, at any size that is asked for; a video's sides are even."""
+    about = SimpleNamespace(cameras=WORLD.training.cameras, duration_us=3000.0)
+    for asked, made in ((None, (120, 192)), ((61, 97), (60, 96))):
+        model = SimpleNamespace(render=lambda c, t, size=asked: np.zeros(size or (c.height, c.width), np.float32))
+        fit_module._write_video(tmp_path / VIDEO, SimpleNamespace(model=model, provenance=about))
+        ok, frame = cv2.VideoCapture(str(tmp_path / VIDEO)).read()
+        assert ok and frame.shape[:2] == made
+
+
 def test_the_report_is_one_page_that_needs_no_network(fitted: Path) -> None:
     page = (fitted / REPORT).read_text()
     own = r"data:(?:image/png;base64)?,|(?:video\.mp4|sheet\.png)\""
