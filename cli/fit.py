@@ -41,7 +41,7 @@ def fit(
     Args:
         scene: A scene folder, or a folder of streams from `record` or `import-dat`.
         method: Name of the method.
-        settings: Other settings of the method, such as motion.lr_grid=0.005; see `spike4dgs methods NAME`.
+        settings: Other settings of the method, such as trainer.lr_means=0.0002; see `spike4dgs methods NAME`.
         out: Folder for model.safetensors, sheet.png, video.mp4 and report.html.
         budget: quick, standard (4 times the steps), paper (the publication's steps), or a multiple of quick.
         poses: auto (given poses are adjusted if matched features show that they are wrong) or given.

@@ -83,7 +83,7 @@ class FitChoice:
 
     Args:
         methods: Names of methods; all installed ones, or all rows of the table, if left out.
-        settings: Other settings, such as motion.lr_grid=0.005. Rows include them in their names, and stay off public
+        settings: Other settings, such as trainer.lr_means=0.0002. Rows include them in their names, and stay off public
             tracks.
         out: Folder for predictions, results, images and logs; OUT/SPLIT for another split than the default.
         seed: Seed of every fit.

@@ -1,5 +1,6 @@
 """`methods` lists what is installed."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -100,6 +101,15 @@ def test_a_method_with_other_settings_has_them_in_its_name_and_parameters() -> N
 def test_settings_that_a_method_does_not_have_are_refused(method: str, setting: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
         with_settings(METHODS[method], (setting,))
+
+
+def test_the_setting_that_help_and_errors_show_is_one_of_the_default_method(capsys) -> None:
+    assert main(["fit", "--help"]) == 0
+    shown = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    setting = re.search(r"such as (\S+=[\d.]+)", shown)[1]
+    with pytest.raises(UserError, match=f"PART.NAME=VALUE, such as {setting}"):
+        with_settings(METHODS["spike4dgs-x"], ("lr",))
+    assert with_settings(METHODS["spike4dgs-x"], (setting,)).name == f"spike4dgs-x[{setting}]"
 
 
 def test_settings_beside_those_of_a_name_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
