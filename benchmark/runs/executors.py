@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -51,10 +52,7 @@ def unordered_executor(workers: int, scheduler: str | None, task_travels_once: b
     travels once to the workers of a cluster would be lost with the last of them. Raises UserError as `executor` does,
     and, while running, where the scheduler is lost.
     """
-    if workers < 1:
-        raise problem("--workers", "a number from 1 up", str(workers), "correct it")
-    if scheduler is not None and workers != 1:
-        raise problem("--workers and --scheduler", "one of them", "both", "the cluster decides about its workers")
+    check_workers(workers, scheduler)
     if scheduler is not None:
         with _cluster(scheduler) as client:
             yield lambda task, chunks: _on_cluster(client, task, chunks, task_travels_once)
@@ -62,6 +60,16 @@ def unordered_executor(workers: int, scheduler: str | None, task_travels_once: b
         yield lambda task, chunks: enumerate(here(task, chunks))
     else:
         yield lambda task, chunks: _in_processes(task, chunks, workers)
+
+
+def check_workers(workers: int, scheduler: str | None) -> None:
+    """Raise UserError for fewer than one worker, for both at once, and for what is no address of a scheduler."""
+    if workers < 1:
+        raise problem("--workers", "a number from 1 up", str(workers), "correct it")
+    if scheduler is not None and workers != 1:
+        raise problem("--workers and --scheduler", "one of them", "both", "the cluster decides about its workers")
+    if scheduler is not None and not re.fullmatch(r"\w+://.+:\d+", scheduler):
+        raise problem("--scheduler", "an address such as tcp://HOST:8786", repr(scheduler), "correct it")
 
 
 def here(task: Callable[[C], R], chunks: Iterable[C]) -> Iterator[R]:

@@ -31,7 +31,7 @@ from spike4dgs.benchmark.metrics.ssim_window import SSIM_WINDOW
 from spike4dgs.benchmark.runs.apart.fit import Apart, fit_job
 from spike4dgs.benchmark.runs.cell import Failure, Job, failure_of, is_done, why_not_kept
 from spike4dgs.benchmark.runs.display import RunDisplay, ShownCell, cell_summary
-from spike4dgs.benchmark.runs.executors import WORKERS_DIED, RunUnordered, unordered_executor
+from spike4dgs.benchmark.runs.executors import WORKERS_DIED, RunUnordered, check_workers, unordered_executor
 from spike4dgs.benchmark.runs.predictions import open_predictions, read_info
 from spike4dgs.benchmark.runs.record import (
     Cell,
@@ -146,6 +146,7 @@ def run_matrix(
     check_scenes(scenes)
     if settings.seeds < 1:
         raise problem("--seeds", "a number from 1 up", str(settings.seeds), "correct it")
+    check_workers(settings.workers, settings.scheduler)
     for method in methods:
         check_method_name(method.name)
     for scene in scenes:

@@ -138,11 +138,12 @@ def test_the_same_command_finds_bad_settings_before_any_work(tmp_path: Path, sma
         ({"seeds": 0}, "--seeds: expected a number from 1 up"),
         ({"workers": 0}, "--workers: expected a number from 1 up"),
         ({"workers": 2, "scheduler": "tcp://127.0.0.1:1"}, "--workers and --scheduler: expected one of them"),
+        ({"scheduler": "foo"}, "--scheduler: expected an address such as tcp://HOST:8786, found 'foo'"),
     ):
         method = CountMethod()
         with pytest.raises(UserError, match=message):
             run(tmp_path / "out", [small_scene], method, **settings)  # type: ignore[arg-type]
-        assert method.fits == 0
+        assert method.fits == 0 and not (tmp_path / "out").exists()
 
 
 @pytest.fixture
