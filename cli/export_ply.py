@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.method.viewing.ply import write_ply
 
 
@@ -18,12 +19,12 @@ def export_ply(model: Positional[Path], out: Path, *, times: int = 30, device: s
     hold colours that a network decodes (the motion `spacetime`), so both are refused.
 
     Args:
-        model: A model saved by run-benchmark: OUT/models/METHOD/SCENE.safetensors.
+        model: A model saved by run-benchmark, OUT/models/METHOD/SCENE.safetensors, or by fit, OUT/model.safetensors.
         out: New folder to write.
         times: Number of files; the clip is divided into as many equal parts, and each file is at the middle of one.
-        device: cpu or cuda.
+        device: auto, cpu or cuda.
     """
-    saved, ticks = write_ply(model, out, times, device)
+    saved, ticks = write_ply(model, out, times, choose_device(device))
     rate = f"{saved.provenance.rate_hz:g} ticks/s"
     print(f"{out}: {times} files of the ticks {ticks[0]} to {ticks[-1]}, {rate} ({saved.title})")
     return 0

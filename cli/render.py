@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
 
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.viewing.camera_paths import PathName, make_path
 from spike4dgs.method.viewing.render_video import PLAYBACK, Playback, render_video
@@ -30,10 +31,10 @@ def render(
         camera: The training camera of `still`; the middle one if left out.
         out: Video, .mp4 (VP9) or .avi (Motion JPEG); SCENE-PATH.mp4 if left out, or none if --frames is given.
         frames: New folder for the frames as PNG.
-        device: cpu or cuda.
+        device: auto, cpu or cuda.
     """
     playback.check()
-    saved = load_model(model, device)
+    saved = load_model(model, choose_device(device))
     if out is None and frames is None:
         out = Path(f"{saved.provenance.scene}-{path}.mp4")
     count, size = render_video(saved, make_path(path, saved.provenance.cameras, camera), playback, out, frames)

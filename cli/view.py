@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.method.models.saved_model import load_model
 from spike4dgs.method.viewing.content import open_content
 from spike4dgs.method.viewing.viewer import Viewer, need_viser
@@ -28,10 +29,10 @@ def view(
         host: Address to serve at; 0.0.0.0 lets other machines connect.
         port: Port to serve at, or the next free one if it is taken.
         allow_gaps: Accept a recording with gaps.
-        device: cpu or cuda.
+        device: auto, cpu or cuda.
     """
     need_viser()
-    viewer = Viewer(open_content(load_model(model, device), scene, allow_gaps), host, port)
+    viewer = Viewer(open_content(load_model(model, choose_device(device)), scene, allow_gaps), host, port)
     print(f"{viewer.content.saved.title}: {viewer.url} (Ctrl-C ends it)", flush=True)
     try:
         viewer.run()

@@ -17,9 +17,9 @@ def check_device(device: str) -> None:
     """Raise UserError unless torch can compute on `device`."""
     try:
         torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as e:
-        found = f"{device!r} ({str(e).splitlines()[0][:80]})"
-        raise problem("device", "cpu, or a CUDA device of this machine", found, "use --device cpu") from None
+    except (RuntimeError, AssertionError):
+        expected = "cpu, or a CUDA device of this machine"
+        raise problem("--device", expected, repr(device), "use --device cpu") from None
 
 
 def seeded(seed: int, step: int) -> torch.Generator:

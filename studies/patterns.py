@@ -14,6 +14,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from spike4dgs.benchmark.arrays import Float64
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.files import atomic_path, check_writable, write_json
 from spike4dgs.benchmark.method import FitRequest, make_budget, training_for
 from spike4dgs.benchmark.reports.console import make_console
@@ -76,10 +77,11 @@ def patterns(
         scene: Scene folder.
         budget: Steps of the fit: quick, standard, or a multiple of quick.
         seed: Seed of everything random.
-        device: cpu, or a CUDA device.
+        device: auto, cpu or cuda.
         out: Folder for a folder of each scene: the maps, their image and the errors.
         allow_gaps: Accept a recording with gaps.
     """
+    device = choose_device(device)
     training = open_scene(scene, allow_gaps).training
     true, out = training.calibrations, out / training.id
     check_writable(out)  # before the fit

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from tyro.conf import Positional
 
+from spike4dgs.benchmark.environment import choose_device
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.method.models.saved_model import SavedModel, load_model
@@ -35,13 +36,14 @@ def render(
         models: Saved models: OUT/models/METHOD/SCENE.safetensors.
         times: Times of the clip at each camera.
         scale: Size, as a multiple of the training views' each way.
-        device: cpu or cuda.
+        device: auto, cpu or cuda.
         csv: Write the table here too.
     """
     if not models:
         raise problem("speed render", "saved models", "none", "name OUT/models/METHOD/SCENE.safetensors of a run")
     if times < 1:
         raise problem("--times", "1 or more", str(times), "correct it")
+    device = choose_device(device)
     loaded = [load_model(path, device) for path in models]
     shots = [_shots(m, times, scale) for m in loaded]
     with one_torch_thread():

@@ -187,7 +187,9 @@ def test_a_recipe_overrides_the_numbers_of_its_image_maker(scene: Scene) -> None
 
 
 def test_a_device_that_is_not_there_is_a_user_error(scene: Scene) -> None:
-    with pytest.raises(UserError, match="device: expected cpu, or a CUDA device.*--device cpu"):
+    with pytest.raises(
+        UserError, match="--device: expected cpu, or a CUDA device of this machine, found 'cuda:99'; use"
+    ):
         METHODS["tfp+static"].fit(scene.training, FitRequest(TINY, "cuda:99"))
 
 

@@ -74,6 +74,17 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
     assert capsys.readouterr().out.strip() == version("spike4dgs")
 
 
+@pytest.mark.parametrize(
+    "command", ["render no", "view no", "export-ply no --out o", "speed render no", "patterns no --out o"]
+)
+def test_commands_of_models_take_the_device_as_fit_does(command: str, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("spike4dgs.cli.view.need_viser", lambda: None)
+    assert main([*command.split(), "--device", "x"]) == 2
+    assert "--device: expected auto, cpu or cuda, found 'x'; choose one of them\n" in capsys.readouterr().err
+    assert main([*command.split(), "--device", "auto"]) == 2
+    assert "error: no: expected a " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*name.split(), "--help"]) == 0
