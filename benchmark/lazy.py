@@ -1,10 +1,13 @@
-"""Public names of a room that are imported when they are first used: importing a room stays instant."""
+"""What is imported when it is first used: public names of a room, whose import stays instant, and pycolmap."""
 
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -22,3 +25,12 @@ def lazy_names(
         return found
 
     return getattribute, lambda: sorted({*vars(sys.modules[package]), *modules})
+
+
+@contextmanager
+def kept_sigterm() -> Iterator[None]:
+    """Put the handling of SIGTERM back after an import inside the context: pycolmap's prints a stack of C++ calls."""
+    yield
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)

@@ -13,6 +13,7 @@ import numpy as np
 from spike4dgs.benchmark.arrays import Float64
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.exchange.foreign_camera import Distort, FoundCamera, check_same, check_size, make_camera
+from spike4dgs.benchmark.lazy import kept_sigterm
 from spike4dgs.benchmark.scene.writer import colmap_distortion
 
 _MOST_BYTES = 1 << 28  # of cameras or images, these with their points
@@ -27,7 +28,8 @@ def read_colmap_model(folder: Path, names: Collection[str], size: tuple[int, int
     `cam_00/000120.png`. For images without a stream there is None. Raises UserError where the model cannot be read,
     and where images of one stream have different cameras.
     """
-    import pycolmap
+    with kept_sigterm():
+        import pycolmap
 
     if not any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt")):
         raise problem(folder, "a COLMAP model (cameras.bin or cameras.txt, ...)", "none", "give its folder: sparse/0")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from spike4dgs.benchmark.croissant import write_croissant
 from spike4dgs.benchmark.errors import problem
 from spike4dgs.benchmark.files import write_json, write_text, writing
+from spike4dgs.benchmark.lazy import kept_sigterm
 from spike4dgs.benchmark.scene.cameras import Camera, to_nerfstudio
 from spike4dgs.benchmark.scene.lens import Distortion, make_distortion
 from spike4dgs.benchmark.scene.manifest import Manifest, write_manifest
@@ -157,7 +158,8 @@ def write_colmap(
     `images` are the names of a camera's images; without them it has one, called like it. Raises UserError where the
     folder cannot be written, or not wholly: pycolmap itself does not notice a full disk.
     """
-    import pycolmap
+    with kept_sigterm():
+        import pycolmap
 
     names = {c.id: [c.id] for c in cameras} if images is None else images
     model, image_id = pycolmap.Reconstruction(), 0

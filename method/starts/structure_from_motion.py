@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.lazy import kept_sigterm
 from spike4dgs.benchmark.metrics.pose_error import align_cameras
 from spike4dgs.benchmark.scene.cameras import Camera
 from spike4dgs.benchmark.scene.images import encode_srgb, write_png
@@ -87,7 +88,8 @@ def find_features(
 
     Views have their calibrated intrinsics, or share a camera whose focal length is a guess, `focal_prior` image widths.
     """
-    import pycolmap
+    with kept_sigterm():  # all that follows works on what this yields
+        import pycolmap
 
     with tempfile.TemporaryDirectory(prefix="spike4dgs-colmap-") as folder, _quiet():
         names = _write_images(Path(folder), cameras, images, settings.enlarge)
@@ -223,9 +225,9 @@ def map_views(
     length for all is estimated. The same seed gives the same poses: everything runs in one thread. Where fewer than
     two views are registered, nothing can be aligned and the mapping is empty.
     """
-    import pycolmap
-
     with find_features(cameras, images, seed, settings, focal_prior) as found:
+        import pycolmap
+
         options = _options(seed, settings.min_angle_deg, refine_focal=focal_prior is not None)
         models = pycolmap.global_mapping(found.database, found.folder, found.folder / "out", options)
         if not models:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spike4dgs.benchmark.files import writing
+from spike4dgs.benchmark.lazy import kept_sigterm
 from spike4dgs.benchmark.method import GIVEN
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.scene.writer import SceneDescription, finish_scene
@@ -69,7 +70,8 @@ def write_nameless_part(scene: Scene, folder: Path, given: Collection[str]) -> S
 
 def _points(scene: Scene) -> NDArray[np.float64]:
     """Return the points [N, 3] of the scene's COLMAP model."""
-    import pycolmap
+    with kept_sigterm():
+        import pycolmap
 
     for name in scene.manifest.only(_MODEL).files:
         scene.manifest.path(name)
