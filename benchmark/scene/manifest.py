@@ -15,9 +15,11 @@ from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json, sha256_file, write_json
 from spike4dgs.benchmark.scene.content import data_files, hash_content, is_encoded
 from spike4dgs.benchmark.screen.shown import Shown
+from spike4dgs.benchmark.spikes.folder import NAME as STREAMS
 from spike4dgs.benchmark.untrusted import matches
 
 NAME = "manifest.json"
+_NAMED = 4  # scenes that a message names
 _SCHEMA = "spike4dgs-manifest/1"
 
 
@@ -133,6 +135,26 @@ def _content(path: Path, name: str, meta: Mapping[str, Any]) -> str | None:
         return hash_content(path, name, meta)
     except (UserError, KeyError, TypeError, ValueError):
         return None
+
+
+def check_scene_folder(root: Path) -> None:
+    """Raise UserError for what is no scene folder, with what it is and what reads it."""
+    if (root / "scene.json").is_file():
+        return
+    expected, scenes = "a scene folder", sorted(path.parent.name for path in root.glob("*/scene.json"))
+    if not root.exists():
+        raise problem(root, expected, "no such folder", "make one with `spike4dgs make-dataset`")
+    if not root.is_dir():
+        raise problem(root, expected, "a file", "name its folder")
+    if (root / STREAMS).is_file():
+        fix = "`fit`, `inspect` and `images` read it; `import-dat --cameras` makes a scene"
+        raise problem(root, expected, "a folder of streams without poses", fix)
+    if scenes:
+        more = ", ..." if len(scenes) > _NAMED else ""
+        raise problem(root, expected, f"a folder of the scenes {', '.join(scenes[:_NAMED])}{more}", "name one")
+    if any(root.glob("*.dat")):
+        raise problem(root, expected, "bare streams", "import them with `spike4dgs import-dat`")
+    raise problem(root / "scene.json", "the description of a scene", "no such file", "check the path")
 
 
 def read_manifest(root: Path) -> Manifest:

@@ -23,7 +23,7 @@ from spike4dgs.benchmark.scene.camera_state import PERFECT, CameraState
 from spike4dgs.benchmark.scene.cameras import Camera, camera_facts, read_cameras
 from spike4dgs.benchmark.scene.content import revision_of
 from spike4dgs.benchmark.scene.images import encode_srgb, read_exr, read_mask, read_rgb
-from spike4dgs.benchmark.scene.manifest import Manifest, read_manifest
+from spike4dgs.benchmark.scene.manifest import Manifest, check_scene_folder, read_manifest
 from spike4dgs.benchmark.scene.other_sensors import EventStream, Frames, events_of, find_events, find_frames, frames_of
 from spike4dgs.benchmark.scene.splits import Target as Target
 from spike4dgs.benchmark.scene.splits import check_splits, read_targets
@@ -263,8 +263,7 @@ def open_scene(root: Path | str, allow_gaps: bool = False, split: str | None = N
     inconsistent, where there is no such split, and where a recording has gaps unless `allow_gaps`.
     """
     root = Path(root)
-    if not root.is_dir():
-        raise problem(root, "a scene folder", "no such folder", "make one with `spike4dgs make-dataset`")
+    check_scene_folder(root)
     meta = read_json(root / "scene.json", f"a {SCHEMA} description")
     check_meta(meta, root / "scene.json")
     manifest = read_manifest(root)

@@ -30,6 +30,7 @@ from spike4dgs.benchmark.runs.cell import timed_fit
 from spike4dgs.benchmark.runs.display import RunDisplay
 from spike4dgs.benchmark.runs.predictions import MethodInfo, check_place
 from spike4dgs.benchmark.runs.provenance import Provenance, Savable
+from spike4dgs.benchmark.scene.manifest import check_scene_folder
 from spike4dgs.benchmark.spikes.folder import NAME as STREAMS
 from spike4dgs.method.fit import RecipeMethod
 from spike4dgs.method.images.base import ImageMaker
@@ -67,6 +68,8 @@ def fit_recording(
     for name in ("scene.json", STREAMS):  # a scene's sheet would be replaced
         if (out / name).is_file():
             raise problem(out, "a folder for the results of a fit", f"a recording ({name})", "choose another --out")
+    if not (scene / STREAMS).is_file():
+        check_scene_folder(scene)  # before OUT is made
     with locked(out / ".lock", out, "a folder that no other fit uses"):
         check_place(out / PREDICTIONS)  # a benchmark's are of all methods and scenes
         remove_parts(out)

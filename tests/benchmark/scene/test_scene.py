@@ -1,5 +1,8 @@
 import json
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +33,42 @@ def test_a_written_scene_is_read_back(small_scene: Path) -> None:
         assert (read.width, read.height) == (WIDTH, HEIGHT)
     truth, moving = scene.ground_truth(scene.targets[1]), scene.moving(scene.targets[1])
     assert truth.shape == moving.shape == (HEIGHT, WIDTH) and truth.dtype == np.float32 and moving.dtype == bool
+
+
+def test_pycolmap_leaves_sigterm_as_it_was(tmp_path: Path) -> None:
+    """Its own handler prints thirty lines of C++ calls where a run is ended."""
+    code = (
+        "import os, signal, sys; from pathlib import Path; from spike4dgs.benchmark.scene.writer import write_colmap\n"
+        "write_colmap(Path(sys.argv[1]), (), ()); os.kill(os.getpid(), signal.SIGTERM)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (
+            ["stream.json", "a.dat"],
+            "found a folder of streams without poses; `fit`, `inspect` and `images` read it",
+        ),
+        (
+            [f"car-{k}/scene.json" for k in range(6)],
+            "a folder of the scenes car-0, car-1, car-2, car-3, ...; name one",
+        ),
+        (["bird-0/scene.json"], "found a folder of the scenes bird-0; name one"),
+        (["a.dat"], "found bare streams; import them with `spike4dgs import-dat`"),
+        (["notes.txt"], "scene.json: expected the description of a scene, found no such file; check the path"),
+    ],
+)
+def test_what_is_no_scene_is_told_as_what_it_is(names: list[str], message: str, tmp_path: Path) -> None:
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(UserError, match=message):
+        open_scene(tmp_path)
+    with pytest.raises(UserError, match="expected a scene folder, found a file; name its folder"):
+        open_scene(next(path for path in tmp_path.rglob("*") if path.is_file()))
 
 
 def test_streams_carry_the_radiance_upright(small_scene: Path) -> None:

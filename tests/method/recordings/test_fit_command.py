@@ -344,6 +344,9 @@ def test_what_cannot_be_done_is_said(fitted: Path, recorded: Path, tmp_path: Pat
         budget = () if "--budget" in arguments else ("--budget", "0.02")
         assert main(["fit", str(recorded), *arguments, *method, *budget, "--poses", "given"]) == 2
         assert message in capsys.readouterr().err
+    assert main(["fit", str(tmp_path / "nothere"), "--out", str(tmp_path / "g"), *QUICK]) == 2
+    assert "nothere: expected a scene folder, found no such folder" in capsys.readouterr().err
+    assert not (tmp_path / "g").exists()
     (tmp_path / "d").mkdir()
     with open(tmp_path / "d/.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
