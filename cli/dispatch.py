@@ -178,6 +178,8 @@ def _find(name: str, table: Mapping[str, Command], prog: str) -> Command:
 def _load(command: Command) -> Callable[..., Any]:
     module, _, function = command.target.partition(":")
     found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    text, heading, entries = (inspect.getdoc(found) or "").partition("\nArgs:\n")
+    found.__doc__ = text + heading + re.sub(r"\n {8}", " ", entries)  # tyro breaks lines where an entry has them
     return found
 
 

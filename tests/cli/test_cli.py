@@ -14,6 +14,7 @@ from spike4dgs.benchmark.runs.record import read_record
 from spike4dgs.cli import COMMANDS, Command, main
 from spike4dgs.cli import dispatch as cli
 from spike4dgs.cli.commands import GROUPS
+from spike4dgs.cli.dispatch import load
 
 HEAVY = ("torch", "numba", "mitsuba", "skimage", "cv2", "scipy", "matplotlib", "numpy", "tyro", "rich")
 
@@ -90,6 +91,7 @@ def test_every_command_has_help_with_an_example(name: str, capsys: pytest.Captur
     assert main([*name.split(), "--help"]) == 0
     text = capsys.readouterr().out
     assert f"usage: spike4dgs {name}" in text
+    assert "\n        " not in (load(name).__doc__ or "").partition("Args:\n")[2], "an entry's lines would break twice"
     assert f"Example:\n  spike4dgs {name}" in text.replace("│", "")
     assert f"{COMMANDS[name].example} ".startswith(f"{name} ") and COMMANDS[name].target.startswith("spike4dgs.cli.")
 
