@@ -33,7 +33,7 @@ def test_a_short_clip_with_right_poses_is_left_alone() -> None:
     found = self_calibrated(recording(SHORT), "auto", "auto", seed=0)
     assert found.recording.training is SHORT and found.changed == ()
     poses, clocks = found.recording.notes
-    assert poses.startswith("poses: taken as given") and "124 ticks tell nothing" in clocks
+    assert poses.startswith("poses: taken as given") and "they need 3 cameras and 124 ticks; this clip has" in clocks
     assert all(float(px) < 0.3 for px in found.columns["pose error, px"].values())
 
 
