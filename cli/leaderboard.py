@@ -19,7 +19,7 @@ from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.record import COSTS
 from spike4dgs.leaderboard.entry import reading_folder
 from spike4dgs.leaderboard.page.intervals import LEVEL
-from spike4dgs.leaderboard.page.rows import Board, find_board, gather
+from spike4dgs.leaderboard.page.rows import Board, find_board, gather, titles
 from spike4dgs.leaderboard.page.scores import compare_rows, image_scores
 from spike4dgs.leaderboard.page.site import write_site
 from spike4dgs.leaderboard.tracks import RELEASE, SHIPPED
@@ -54,9 +54,24 @@ def show(
     for board in [find_board(boards, track)] if track else boards:
         if track or any(row.ranked for row in board.rows):
             console.print(ranking_table(board, metric, console.width))
+    for run in runs if track else ():
+        on = _boards_of(boards, run)
+        if on and not any(track in names for names in on):
+            text = f"no record of exactly the scenes of {track}, given what it gives"
+            boards_text = ", ".join(title for _, title in on)
+            console.print(f"{run}: {text}; it is on the board {boards_text}", highlight=False, markup=False)
     for item in refused:
         console.print(f"not listed: {item['entry']}: {item['reason']}", markup=False)
     return 0
+
+
+def _boards_of(boards: Sequence[Board], run: Path) -> list[tuple[str, str]]:
+    """Return name and title of the boards that list a run, or entries to whose rows it lends its images."""
+    return [
+        (board.name, title)
+        for board, title in zip(boards, titles(boards), strict=True)
+        if any(row.run == run or any(run in path.parents for path in row.predictions.values()) for row in board.rows)
+    ]
 
 
 def build(

@@ -37,8 +37,10 @@ def render(
     saved = load_model(model, choose_device(device))
     if out is None and frames is None:
         out = Path(f"{saved.provenance.scene}-{path}.mp4")
+    replaced = out is not None and out.is_file()
     count, size = render_video(saved, make_path(path, saved.provenance.cameras, camera), playback, out, frames)
     seconds = count / playback.fps
     for target in filter(None, (out, frames)):
-        print(f"{target}: {count} frames of {size[0]}x{size[1]}, {seconds:.1f} s at {playback.fps:g} frames/s")
+        what = f"{count} frames of {size[0]}x{size[1]}, {seconds:.1f} s at {playback.fps:g} frames/s"
+        print(f"{target}: {what}" + ("; an earlier video was replaced" if replaced and target == out else ""))
     return 0

@@ -6,6 +6,7 @@ another split than the default keeps all this in OUT/SPLIT/, and so does a table
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,6 +49,13 @@ from spike4dgs.leaderboard.reading import typical_fit_seconds
 from spike4dgs.leaderboard.tracks import is_equivalent, release_line, track_scenes
 
 _NEEDS = {"profile": ("table",), "data": ("table", "track"), "source": ("track",)}  # what they do nothing without
+
+# What makes a track's scenes, where `make-dataset` has no track of its name.
+_MADE = {
+    "quick-start": "car turntable --profile small",
+    "no-flat-field": "--track ideal",
+    "uncalibrated": "--track ideal",
+}
 
 
 @dataclass(frozen=True)
@@ -166,7 +174,9 @@ def run_benchmark(
             raise problem("--table", "no scene folders beside it", str(scenes[0]), "use --data and --profile")
         return _run_table(paper, choice, fits, entries)
     if choice.track is not None:
-        scenes = track_folders(track_scenes(choice.track), choice.data, choice.source, is_equivalent)
+        options = _MADE.get(choice.track, f"--track {choice.track}")
+        made = f"spike4dgs make-dataset {options} --out {shlex.quote(str(choice.data))}"
+        scenes = track_folders(track_scenes(choice.track), choice.data, choice.source, is_equivalent, made)
     runs = _run(scenes, _choose_methods(fits, None), (choice.split,), choice.allow_gaps, fits)
     return _finish(runs, scenes, choice.allow_gaps, entries)
 
@@ -237,7 +247,7 @@ def _finish(runs: Sequence[SplitRun], scenes: tuple[Path, ...], allow_gaps: bool
             allow_gaps=allow_gaps,
         )
         make_console().print(
-            f"ranking among the published entries: spike4dgs leaderboard --runs {run.settings.out}",
+            f"ranking among the published entries: spike4dgs leaderboard --runs {shlex.quote(str(run.settings.out))}",
             highlight=False,
             markup=False,
         )

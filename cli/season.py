@@ -24,6 +24,7 @@ from spike4dgs.leaderboard.season.season_file import (
     SEASONS,
     Rendering,
     Seed,
+    is_announced,
     read_season,
     season_folder,
 )
@@ -207,6 +208,9 @@ def check(
     for option, folder in (("--scenes", scenes), ("--predictions", predictions)):
         if folder is not None and not folder.is_dir():
             raise problem(option, "a folder", f"{folder}, which is none", "correct the path")
+    if not is_announced(seasons, number):
+        fix = "run this in a checkout, or give --seasons FOLDER"
+        raise problem(season_folder(seasons, number) / season_file.NAME, "a season", "no such file", fix)
     wrong = 0
     for one in checks(read_season(seasons, number), seasons, scenes, predictions):
         try:

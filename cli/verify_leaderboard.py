@@ -50,6 +50,9 @@ def verify_leaderboard(
         refit: Fit again the entries labelled re-fitted.
         container: Command that starts the process of such a fit, as in `submit`.
     """
+    if not leaderboard.is_dir():
+        fix = "run this in a checkout, or give the leaderboard's folder"
+        raise problem(leaderboard, "a leaderboard", "no such folder", fix)
     if predictions is not None and not predictions.is_dir():
         raise problem(predictions, "a folder of predictions, METHOD/SCENE", "no such folder", "correct --predictions")
     asked = {"--predictions": predictions, "--scenes": scenes, "--refit": refit, "--container": container}
@@ -69,6 +72,6 @@ def verify_leaderboard(
     again_text = f", {found.scored} scored again" if predictions is not None else ""
     if found.not_fitted:
         again_text += f", {found.not_fitted} labelled re-fitted and not fitted again (--refit)"
-    count = f"{len(found.problems)} problems" if found.problems else "no problems"
+    count = f"{len(found.problems) or 'no'} problem{'s' * (len(found.problems) != 1)}"
     print(f"{leaderboard}: release {release.number}, {found.entries} entries{again_text}, {count}")
     return 1 if found.problems else 0

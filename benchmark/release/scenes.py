@@ -226,10 +226,15 @@ def check_revisions(source: Source, release: Release, revisions: Mapping[str, st
 
 
 def track_folders(
-    revisions: Mapping[str, str], data: Path, address: str | None, is_equivalent: Callable[[Scene], bool]
+    revisions: Mapping[str, str],
+    data: Path,
+    address: str | None,
+    is_equivalent: Callable[[Scene], bool],
+    made: str = "make-dataset",
 ) -> tuple[Path, ...]:
     """Return the folders DATA/SCENE of a track's scenes (id -> revision); what is missing is downloaded first.
 
+    `made` is the command that makes them, for the error where there is no address.
     Raises UserError where a scene of another revision is there that is not equivalent, and where none can be
     downloaded.
     """
@@ -246,7 +251,7 @@ def track_folders(
         if not all((root / path).is_file() for path in opened.manifest.files):  # of a download of some parts
             missing[scene] = revision
     if missing:
-        source = find_source(address, f"a release with {', '.join(missing)}")
+        source = find_source(address, f"a release with {', '.join(missing)}", made)
         release = open_release(source)
         check_revisions(source, release, missing)
         print(f"{data}: downloading {', '.join(missing)} from {source.address}")

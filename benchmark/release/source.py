@@ -184,11 +184,11 @@ class Source:
             raise Stopped
 
 
-def find_source(address: str | None, what: str) -> Source:
+def find_source(address: str | None, what: str, made: str = "make-dataset") -> Source:
     """Return the source at an address, or at the one that SPIKE4DGS_RELEASE names. Raises UserError without either."""
     chosen = address or os.environ.get(VARIABLE)
     if not chosen:
-        fix = f"there is no public server yet: add --from ADDRESS, set {VARIABLE}, or render with make-dataset"
+        fix = f"there is no public server yet: add --from ADDRESS, set {VARIABLE}, or render with `{made}`"
         raise problem("--from", f"the address of {what}", "none", fix)
     return Source(chosen)
 

@@ -41,7 +41,7 @@ _LEAST_SEEN = 0.5  # least share of a camera's pixels with a surface
 
 @dataclass(frozen=True)
 class MakeBursts:
-    """Renders the shard of a (world, variant); can be sent to worker processes.
+    """What each shard contains.
 
     Args:
         rigs: Rigs of nine cameras in each training variant; hidden variants have half as many.

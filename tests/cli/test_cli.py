@@ -76,6 +76,20 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize(
+    ("track", "made"),
+    [
+        ("ideal", "--track ideal"),
+        ("uncalibrated", "--track ideal"),
+        ("quick-start", "car turntable --profile small"),
+    ],
+)
+def test_a_track_whose_scenes_are_not_here_says_what_makes_them(track: str, made: str, capsys, monkeypatch) -> None:
+    monkeypatch.delenv("SPIKE4DGS_RELEASE", raising=False)
+    assert main(["run-benchmark", "--track", track, "--data", "no where"]) == 2
+    assert f"or render with `spike4dgs make-dataset {made} --out 'no where'`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     "command", ["render no", "view no", "export-ply no --out o", "speed render no", "patterns no --out o"]
 )
 def test_commands_of_models_take_the_device_as_fit_does(command: str, capsys, monkeypatch) -> None:
@@ -106,6 +120,14 @@ def test_every_command_has_help_with_an_example(name: str, capsys: pytest.Captur
         (["score", "nowhere", "also-nowhere"], "also-nowhere: expected a scene folder, found no such folder"),
         (["submit", "nothing.json"], "nothing.json: expected a spike4dgs-result/1 record, found no such file"),
         (["verify", "nowhere"], "nowhere: expected a scene folder"),
+        (
+            ["verify-leaderboard", "nowhere"],
+            "nowhere: expected a leaderboard, found no such folder; run this in a checkout",
+        ),
+        (
+            ["season", "check", "0", "--seasons", "nowhere"],
+            "nowhere/0/season.json: expected a season, found no such file; ",
+        ),
         (["verify"], "scenes: expected at least one scene folder"),
         (["submit", "result.json", "--container", "env"], "--container: expected --refit beside it, found none"),
         # The command lines that `season check` prints after the reveal have seeds of 128 bits.

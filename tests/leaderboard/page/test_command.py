@@ -40,7 +40,10 @@ def test_own_runs_stand_beside_and_failures_have_a_reason(
     monkeypatch.chdir(tmp_path)
     assert main(["leaderboard", "--runs", str(finished / "out")]) == 0
     out = capsys.readouterr().out
-    assert "out/tfp+4dgs" in out and "pattern-0 failed" in out and "ideal" in out
+    assert "out/tfp+4dgs" in out and "pattern-0 failed" in out and "ideal" in out and "no record" not in out
+    assert main(["leaderboard", "--track", "ideal", "--runs", str(finished / "out")]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "/out: no record of exactly the scenes of ideal, given what it gives; it is on the board pattern-0" in out
 
 
 def test_an_empty_folder_has_the_published_entries(

@@ -135,7 +135,7 @@ def shown(path: Path) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize(("path", "suffix"), [("orbit", ".mp4"), ("still", ".avi")])
-def test_a_video_has_the_frames_of_the_model(saved: Path, tmp_path: Path, path: PathName, suffix: str) -> None:
+def test_a_video_has_the_frames_of_the_model(saved: Path, tmp_path: Path, path: PathName, suffix: str, capsys) -> None:
     out, frames = tmp_path / f"v{suffix}", tmp_path / "frames"
     options = ["--path", path, "--slow-motion", "48", "--fps", "25", "--out", str(out), "--frames", str(frames)]
     assert main(["render", str(saved), *options]) == 0
@@ -153,6 +153,9 @@ def test_a_video_has_the_frames_of_the_model(saved: Path, tmp_path: Path, path: 
     for image, wanted in zip(found, expected, strict=True):
         assert np.abs(image.astype(int) - wanted).mean() < 6
     assert {p.name for p in tmp_path.iterdir()} == {"m.safetensors", out.name, "frames"}, "nothing half written"
+    assert "replaced" not in capsys.readouterr().out
+    assert main(["render", str(saved), "--slow-motion", "1", "--out", str(out)]) == 0
+    assert capsys.readouterr().out.endswith("frames/s; an earlier video was replaced\n")
 
 
 @pytest.mark.parametrize(("count", "first"), [(3, "00000.png"), (100_001, "000000.png")])
