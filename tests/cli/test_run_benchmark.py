@@ -51,9 +51,10 @@ def brief(no_images: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_results_images_and_entries_stay(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
+    out = tmp_path / "my runs"
     assert run_here((small_scene,), methods=("counts", "quick+counts"), out=out, device="cpu", budget="0.5") == 0
     text = capsys.readouterr().out
+    assert f"spike4dgs leaderboard --runs '{out}'" in text.replace("\n", " "), "a line to copy"
     assert "quick+counts" in text and "Results" in text and "re-scored, place 1 of 2 by mean PSNR" in text
     for name in ("sheet_pattern-0", "scatter"):
         with Image.open(out / f"{name}.png") as image:

@@ -66,7 +66,7 @@ def test_the_command_takes_a_tracks_scenes(
     source = str(release_folder)
     assert command.download("outdoor", source=source, out=tmp_path, selection=Selection(parts=("images",))) == 0
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["pattern-1"]
-    with pytest.raises(UserError, match="--scenes: expected scenes of outdoor: pattern-1, found pattern-0"):
+    with pytest.raises(UserError, match="--scenes of outdoor: expected one of pattern-1, found 'pattern-0'"):
         command.download("outdoor", source=source, out=tmp_path, selection=Selection(scenes=("pattern-0",)))
     monkeypatch.setattr(command, "track_scenes", lambda name: {"pattern-1": "22"})
     with pytest.raises(UserError, match="expected pattern-1 in revision 22"):
