@@ -203,6 +203,8 @@ def check_record(record: Record, where: str | Path) -> None:
         raise problem(where, f"cells for {', '.join(sorted(record['dataset']['scenes']))}", found, _AGAIN)
     if unknown := sorted(record.get("sensors", {}).keys() - record["scenes"].keys()):
         raise problem(where, "sensors of its scenes", ", ".join(unknown)[:200], _AGAIN)
+    if unknown := sorted(record["dataset"].get("equivalent", {}).keys() - record["scenes"].keys()):
+        raise problem(where, "equivalents of its scenes", ", ".join(unknown)[:200], _AGAIN)
     for scene, cell in record["scenes"].items():
         for name, values in (("metrics", cell["metrics"]), *cell["per_image"].items()):
             _check_metric_names(values, f"{where}, scene {scene}, {name}")

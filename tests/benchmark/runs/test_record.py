@@ -186,6 +186,11 @@ def test_records_state_the_sensor_and_older_ones_need_not(small_scene: Path, tmp
     for wrong, message in (({"elsewhere": "ideal"}, "sensors of its scenes"), ({"pattern-0": "fine"}, "fine")):
         with pytest.raises(UserError, match=message):
             records.check_record({**again, "sensors": wrong}, "wrong")
+    of_release = {"revision": "ab" * 32, "bits": 0.0}
+    records.check_record({**again, "dataset": {**again["dataset"], "equivalent": {"pattern-0": of_release}}}, "right")
+    with pytest.raises(UserError, match="expected equivalents of its scenes, found elsewhere"):
+        dataset = {**again["dataset"], "equivalent": {"elsewhere": of_release}}
+        records.check_record({**again, "dataset": dataset}, "wrong")
 
 
 def test_the_schema_has_the_same_words() -> None:
