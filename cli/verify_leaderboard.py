@@ -14,7 +14,7 @@ from spike4dgs.benchmark.runs.apart.fit import Apart
 from spike4dgs.benchmark.runs.record import Record
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.cli.submit import second_renderings_of
-from spike4dgs.leaderboard.submit import fit_again, refits_of
+from spike4dgs.leaderboard.refit import fit_again, refits_of
 from spike4dgs.leaderboard.tracks import current_release
 from spike4dgs.leaderboard.verify_entries import verify_leaderboard as check
 

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from spike4dgs.benchmark.environment import environment, harness, utc_now
 from spike4dgs.benchmark.errors import UserError, problem
-from spike4dgs.benchmark.files import sha256_json, user_cache
-from spike4dgs.benchmark.method import PAPER, Budget, Method, choose_device_for, get_method
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.reports.console import make_console
 from spike4dgs.benchmark.runs.apart.fit import Apart
-from spike4dgs.benchmark.runs.cell import Job
-from spike4dgs.benchmark.runs.record import COSTS, Record, read_record
-from spike4dgs.benchmark.runs.refinement import SUFFIX
-from spike4dgs.benchmark.runs.run import Settings, run_matrix
+from spike4dgs.benchmark.runs.record import Record, read_record
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.leaderboard.entry import (
     CLAIMED,
@@ -35,81 +27,11 @@ from spike4dgs.leaderboard.entry import (
     write_entry,
 )
 from spike4dgs.leaderboard.rank import FILES, standing, write_boards
+from spike4dgs.leaderboard.refit import fit_again, refits_of
 from spike4dgs.leaderboard.thumbnails import Thumbnails, make_thumbnails
 from spike4dgs.leaderboard.tracks import LOCAL, place_of, with_equivalents
 from spike4dgs.leaderboard.truth_check import SecondRenderings, no_renderings
-from spike4dgs.leaderboard.verify import TOLERANCE_DB, verify_record
-
-
-@dataclass(frozen=True)
-class Refit:
-    """The second fit: PSNR and costs by scene, and whether its predictions equal the first ones in every bit."""
-
-    psnr: Mapping[str, float]
-    tolerance_db: float
-    bit_equal: bool
-    costs: Mapping[str, Mapping[str, float | None]]
-    apart: str  # what kept the fit to the training parts: PROCESS or CONTAINER
-
-
-PROCESS, CONTAINER = "process", "container"
-
-
-def fit_again(record: Record, scenes: Sequence[Scene], work: Path, console: Console, apart: Apart) -> Refit:
-    """Fit a record's method on its scenes with its seed, budget and device, and compare the scores.
-
-    Each fit has a process that sees the training part of its scene alone; `apart` may start it in a container.
-    The run in `work` resumes after a kill and is removed at the end. Raises UserError where the installed method is
-    another one than the record's, where a fit fails, and where a scene's PSNR differs by more than the tolerance.
-    """
-    name = record["method"]["name"]
-    method = get_method(name.removesuffix(SUFFIX))
-    out = work / sha256_json([record["method"], record["dataset"]])[:16]
-    psnr, costs, bit_equal = dict[str, float](), dict[str, Mapping[str, float | None]](), True
-    for scene in (s for s in scenes if s.id in record["scenes"]):
-        claimed = record["scenes"][scene.id]
-        again = _fit_scene(record, claimed, method, scene, out / scene.id, console, apart)
-        psnr[scene.id], costs[scene.id] = again["metrics"]["psnr"], {cost: again[cost] for cost in COSTS}
-        if abs(psnr[scene.id] - claimed["metrics"]["psnr"]) > TOLERANCE_DB:
-            expected = f"a second fit within {TOLERANCE_DB} dB of the claimed {claimed['metrics']['psnr']:.2f} dB"
-            fix = "submit what this version of the method gives"
-            raise problem(f"{name} on {scene.id}", expected, f"{psnr[scene.id]:.2f} dB", fix)
-        bit_equal = bit_equal and again["predictions_sha256"] == claimed["predictions_sha256"]
-    shutil.rmtree(out)
-    return Refit(psnr, TOLERANCE_DB, bit_equal, costs, CONTAINER if apart.container else PROCESS)
-
-
-def _fit_scene(
-    record: Record,
-    claimed: Mapping[str, Any],
-    method: Method,
-    scene: Scene,
-    out: Path,
-    console: Console,
-    apart: Apart,
-) -> Mapping[str, Any]:
-    wanted, where = record["method"], f"{record['method']['name']} on {scene.id}"
-    if claimed["status"] != "ok" or claimed["budget"] is None or wanted["seed"] is None:
-        fix = "submit without --refit"
-        raise problem(where, "a scored cell with budget and seed", "none", fix)
-    budget = Budget(published=True) if claimed["budget"] == PAPER else Budget(float(claimed["budget"]))
-    device = choose_device_for([method], claimed["device"] or "cpu")
-    variants = {v.name: v for v in Job(method, scene, wanted["seed"], device, budget).variants}
-    found = variants[wanted["name"]].as_dict() if wanted["name"] in variants else {}
-    if other := sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k)):
-        fix = "install the version that made the record, or submit without --refit"
-        raise problem(where, "the installed method as in the record", f"another {', '.join(other)}", fix)
-    settings = Settings(out, seed=wanted["seed"], device=device, budget=budget, metrics=("psnr",), apart=apart)
-    records = {r["method"]["name"]: r for r in run_matrix([scene], [method], settings, console)}
-    cell: Mapping[str, Any] = records[wanted["name"]]["scenes"][scene.id]
-    if cell["status"] != "ok" or cell["metrics"]["psnr"] is None:
-        raise problem(where, "a second fit that ends", cell["error"] or "no PSNR", f"see {out}")
-    return cell
-
-
-def refits_of(leaderboard: Path) -> Path:
-    """Return the folder of a leaderboard's second fits: the user's, as a sent leaderboard may hold any predictions."""
-    return user_cache() / "refits" / sha256_json(str(leaderboard.resolve()))[:16]
+from spike4dgs.leaderboard.verify import verify_record
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class Job:
     seed: int
     device: str
     budget: Budget
-    refined: bool = False  # held-out cameras are refined besides, even where the method does not ask for it
+    refined: bool | None = None  # whether held-out cameras are refined besides; None: as the method asks
 
     @property
     def info(self) -> MethodInfo:
@@ -61,7 +61,7 @@ class Job:
     def variants(self) -> tuple[MethodInfo, ...]:
         """The method as it is, and with refined held-out cameras where that is asked for: one record each."""
         refined = replace(self.info, name=self.method.name + SUFFIX)
-        asked = self.refined or getattr(self.method, "refines_views", False)
+        asked = getattr(self.method, "refines_views", False) if self.refined is None else self.refined
         has_streams = set(self.scene.test) <= set(self.scene.meta["streams"])  # refinement needs them
         return (self.info, refined) if asked and has_streams else (self.info,)
 

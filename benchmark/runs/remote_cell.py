@@ -61,7 +61,7 @@ class Order:
     folder: SharedFolder
     work: Path  # of the checkpoint, in the shared folder
     apart: Apart | None = None
-    refined: bool = False
+    refined: bool | None = None
 
 
 @dataclass(frozen=True)

@@ -64,6 +64,7 @@ class Settings:
     refit: bool = False  # also where predictions are there
     typical_s: Mapping[str, float] = field(default_factory=dict)  # of fits by method, somewhere: their ratios count
     apart: Apart | None = None  # fits have a process each, which sees the training part alone; None: they see all
+    refined: bool | None = None  # as of a job
 
     @property
     def spreads(self) -> bool:
@@ -154,7 +155,7 @@ def run_matrix(
     selection = select_metrics(settings.metrics)
     jobs = [
         JobFiles(
-            Job(method, scene, seed, settings.device, settings.budget),
+            Job(method, scene, seed, settings.device, settings.budget, settings.refined),
             settings.folder(seed),
             settings.refit,
             settings.apart,

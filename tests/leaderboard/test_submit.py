@@ -15,7 +15,7 @@ from submissions import board, enter, entry_of, read, release_of, submit
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import sha256_json, write_bytes
 from spike4dgs.cli.submit import submit_all
-from spike4dgs.leaderboard.submit import refits_of
+from spike4dgs.leaderboard.refit import refits_of
 
 
 def test_with_files_an_entry_is_re_scored(done: Path, released: None, said: Any) -> None:

@@ -136,19 +136,20 @@ class Swaps(CountMethod):
         return self.inner.render(camera, t_us)
 
 
-class ReadsPath(CountMethod):
-    """Reads a file by a path that it knows, and writes down the error, if any."""
+class ReadsAndKeeps(CountMethod):
+    """Reads a file by a path that it knows, keeps something for its next fit, and prints the errors, if any."""
 
-    def __init__(self, path: Path, report: Path) -> None:
-        super().__init__("reads-path")
-        self._path, self._report = path, report
+    def __init__(self, path: Path, kept: Path) -> None:
+        super().__init__("reads-and-keeps")
+        self._path, self._kept = path, kept
 
     def fit(self, scene: TrainingScene, request: FitRequest) -> Any:
-        try:
-            self._path.read_bytes()
-            self._report.write_text("read")
-        except OSError as e:
-            self._report.write_text(type(e).__name__)
+        for what, act in (("read", self._path.read_bytes), ("kept", lambda: self._kept.write_text("it"))):
+            try:
+                act()
+                print(f"{what}: done")
+            except OSError as e:
+                print(f"{what}: {e.strerror}")
         return super().fit(scene, request)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from changes import exchange, flip_bit, leave_part
 from dummy_methods import CountMethod, FailingMethod, prediction_bytes, without_timings
+from nosy_methods import Refines
 from rich.console import Console
 from small_scenes import write_small_scene
 
@@ -377,3 +378,8 @@ def test_a_method_without_its_weights_is_skipped_and_the_record_has_no_path(smal
     assert (cell["status"], cell["error"]) == ("skipped", "needs net.pth")
     assert str(tmp_path) not in json.dumps(record["scenes"])
     assert str(tmp_path) in (tmp_path / "out/logs/learned__pattern-0.log").read_text()
+
+
+def test_views_to_refine_by_stay_out_of_a_run_that_wants_none(small_scene: Path, tmp_path: Path) -> None:
+    records = run(tmp_path / "out", [small_scene], Refines(tmp_path / "seen.json"), metrics=("psnr",), refined=False)
+    assert [r["method"]["name"] for r in records] == ["refines"] and not (tmp_path / "seen.json").exists()

@@ -17,7 +17,7 @@ import dummy_methods
 import pytest
 from changes import edit_json, files_in
 from dummy_methods import CountMethod, FailingMethod, WorkerKiller, prediction_bytes, run, wait_for, without_timings
-from nosy_methods import DiesBesideItsChild, LacksWeights, LooksAround, PlaysBack, ReadsPath, Refines, Swaps
+from nosy_methods import DiesBesideItsChild, LacksWeights, LooksAround, PlaysBack, ReadsAndKeeps, Refines, Swaps
 from rich.console import Console
 from small_scenes import write_small_scene
 
@@ -322,14 +322,22 @@ def has_namespaces() -> bool:
 
 
 @pytest.mark.skipif(not has_namespaces(), reason="needs unshare and user namespaces")
-def test_in_a_container_not_even_a_known_path_is_read(small_scene: Path, tmp_path: Path) -> None:
-    """The command of the documentation: an empty folder lies over the scene's."""
-    stream, found = small_scene / "spikes/cam_03.dat", tmp_path / "found"
+def test_in_a_container_no_known_path_is_read_and_nothing_is_kept(
+    small_scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The command of the documentation: an empty folder lies over the scene's, and the work alone may be written to.
+
+    But for /tmp, where this test's folders are.
+    """
+    stream, kept = small_scene / "spikes/cam_03.dat", tmp_path / "kept"
     unshare = "unshare --user --map-root-user --mount --net --pid --fork --kill-child --mount-proc"
-    fence = f"""{unshare} sh -c 'mount -t tmpfs none "$0" && exec "$@"' {small_scene}"""
-    cell = cell_of(run(tmp_path / "out", [small_scene], ReadsPath(stream, found), apart=Apart(fence), **PSNR))
-    assert cell["status"] == "ok" and found.read_text() == "FileNotFoundError"
-    assert stream.is_file(), "outside it is there"
+    inside = """mount --bind "$1" "$1" && mount -o remount,bind,ro / && for d in "$0" /dev/shm; do
+        mount -t tmpfs none "$d" || exit; done; shift; exec "$@" """
+    fence = f"{unshare} sh -c '{inside}' {small_scene} {{work}}"
+    cell = cell_of(run(tmp_path / "out", [small_scene], ReadsAndKeeps(stream, kept), apart=Apart(fence), **PSNR))
+    assert cell["status"] == "ok" and stream.is_file(), "outside it is there"
+    said = capfd.readouterr().err
+    assert "read: No such file" in said and "kept: Read-only file system" in said and not kept.exists()
 
 
 def test_a_method_of_a_package_travels_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
