@@ -39,8 +39,9 @@ def verify_leaderboard(
 
     With predictions and scenes, entries whose files are there are also scored again, and the verification that they
     state is compared with the result. If an entry's predictions are there but are not its own, a line says why they are
-    passed over. Second renderings of a target take half a minute per scene. With --refit, entries that are labelled
-    re-fitted are fitted again. Problems are listed on stderr, and the exit code is then 1.
+    passed over; another says which metrics could not be computed here. Second renderings of a target take half a minute
+    per scene. With --refit, entries that are labelled re-fitted are fitted again. Problems are listed on stderr, and
+    the exit code is then 1.
 
     Args:
         leaderboard: Leaderboard folder.
@@ -67,6 +68,8 @@ def verify_leaderboard(
     found = check(leaderboard, predictions, scenes, allow_gaps, second_renderings_of, again if refit else None)
     for line in found.passed_over:
         print(f"passed over: {line}", file=sys.stderr)
+    for line in found.not_computed:
+        print(f"not checked: {line}", file=sys.stderr)
     for line in found.problems:
         print(f"error: {line}", file=sys.stderr)
     again_text = f", {found.scored} scored again" if predictions is not None else ""

@@ -29,13 +29,15 @@ _EDITED = "the entry was edited: restore it, or submit the record again with --r
 class Findings:
     """What came of checking a leaderboard: how many entries it has, how many were scored and fitted again, and the
     problems. `not_fitted` counts the entries that are labelled re-fitted, which scores alone do not bear out.
-    `passed_over` says of which entries there are predictions that were not scored, and why."""
+    `passed_over` says of which entries there are predictions that were not scored, and why; `not_computed` which
+    metrics an entry says were computed again, and were not now."""
 
     entries: int
     scored: int
     not_fitted: int
     problems: tuple[str, ...]
     passed_over: tuple[str, ...]
+    not_computed: tuple[str, ...]
 
 
 def verify_leaderboard(
@@ -57,7 +59,7 @@ def verify_leaderboard(
     entries = reading.entries
     problems = [f"{leaderboard / printable(path)}: {reason}" for path, reason in reading.refused.items()]
     problems += [*_stale_boards(leaderboard, make_boards(reading)), *_wrong_sheets(leaderboard, reading)]
-    scored, not_fitted, passed_over = 0, 0, list[str]()
+    scored, not_fitted, passed_over, not_computed = 0, 0, list[str](), list[str]()
     if predictions is not None:
         by_id = {open_scenes([scene], allow_gaps)[0].id: scene for scene in scenes}
         rendered = once_a_scene(second_renderings)
@@ -67,7 +69,9 @@ def verify_leaderboard(
                 if why:
                     passed_over.append(f"{leaderboard / path}: {why}")
                 if opened:
-                    _score_again(leaderboard / path, entry, predictions, opened, rendered)
+                    if lacks := _score_again(leaderboard / path, entry, predictions, opened, rendered):
+                        said = f"says that {', '.join(lacks)} was computed again; its weights or files are not here"
+                        not_computed.append(f"{leaderboard / path}: {said}")
                     scored += 1
                     if entry["verification"]["label"] == RE_FITTED:
                         not_fitted += fit_again is None
@@ -77,7 +81,7 @@ def verify_leaderboard(
         if not scored and not problems:
             expected = "predictions METHOD/SCENE of an entry, and its scenes"
             problems.append(str(problem(predictions, expected, "none", "correct --predictions")))
-    return Findings(len(entries), scored, not_fitted, tuple(problems), tuple(passed_over))
+    return Findings(len(entries), scored, not_fitted, tuple(problems), tuple(passed_over), tuple(not_computed))
 
 
 def _stale_boards(leaderboard: Path, boards: Mapping[str, Any]) -> Iterator[str]:
@@ -139,12 +143,15 @@ def _scenes_of(
 
 def _score_again(
     where: Path, entry: Entry, predictions: Path, scenes: Sequence[Scene], second_renderings: SecondRenderings
-) -> None:
-    """Score an entry's predictions again. Raises UserError where its record or its verification says otherwise."""
+) -> list[str]:
+    """Score an entry's predictions again, and return the metrics that it says were, and could not be now.
+
+    Raises UserError where its record or its verification says otherwise.
+    """
     record, stated = entry["record"], entry["verification"]
     rescored = verify_record(record, where, predictions / record["method"]["name"], scenes, second_renderings)
     if stated["label"] == CLAIMED:
-        return
+        return []
     hidden = {m for m in stated["unverified"] if METRICS[m].weights is None} - rescored.unverified
     if hidden:
         fix = "submit the record again with --replace"
@@ -165,6 +172,7 @@ def _score_again(
     if KEY in entry:
         made = make_thumbnails(record, predictions / record["method"]["name"], scenes)
         check_sheet(sheet_path(where), entry[KEY], made)
+    return [metric for metric in METRICS if metric in rescored.unverified - set(stated["unverified"])]
 
 
 def _check_truth(where: str, stated: Mapping[str, Any], found: TruthCheck, elsewhere: bool) -> None:

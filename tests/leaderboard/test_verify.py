@@ -280,6 +280,28 @@ def test_a_metric_whose_files_were_missing_is_no_edit(done: Path, problems: Any,
     assert not problems(done, **files_of(done))
 
 
+def test_a_forged_metric_whose_weights_are_not_here_is_named(
+    entered: Path, monkeypatch: pytest.MonkeyPatch, said: Any
+) -> None:
+    weights = METRICS["lpips_alex"].weights
+    assert weights
+
+    def forge(entry: dict[str, Any]) -> None:
+        for cell in entry["record"]["scenes"].values():
+            cell["computed"]["lpips_alex"] = weights.sha256
+            del cell["notes"]["lpips_alex"]
+            for values in (*cell["per_image"].values(), cell["metrics"], entry["record"]["mean"]):
+                values["lpips_alex"] = 1e-4
+
+    monkeypatch.setenv("TORCH_HOME", str(entered / "torch"))
+    edit_with_ledger(entry_of(entered), forge)
+    enter(entered, "bad", verified=False)  # writes the boards anew
+    said()
+    assert verify_leaderboard(entered / "board", **files_of(entered)) == 0
+    named = "tfp+4dgs.json: says that lpips_alex was computed again; its weights or files are not here"
+    assert f"not checked: {entry_of(entered).parent}/{named}" in said()
+
+
 def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A noise share that was edited, or removed as if nobody had measured it."""
     edit_with_ledger(entry_of(entered), edit_truth(noise_share=0.0, noise_share_error=0.01, ceiling_db=60.0))
