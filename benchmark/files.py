@@ -202,12 +202,13 @@ def read_bytes(path: Path, what: str, most_bytes: int = MOST_BYTES) -> bytes:
         raise problem(path, what, (e.strerror or "an unreadable file").lower(), "check the path") from None
 
 
-def read_json(path: Path, what: str) -> dict[str, Any]:
+def read_json(path: Path, what: str, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     """Read a JSON object. `what` names the kind of file for the error.
 
-    Raises UserError where the file is missing, is not JSON, is not an object, or breaks a bound of `parse_json`.
+    Raises UserError where the file is missing, is not JSON, is not an object, has more than `most_bytes`, or breaks a
+    bound of `parse_json`.
     """
-    return json_object(read_bytes(path, what), path, what)
+    return json_object(read_bytes(path, what, most_bytes), path, what)
 
 
 def json_object(data: bytes, path: Path, what: str) -> dict[str, Any]:

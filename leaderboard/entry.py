@@ -9,19 +9,13 @@
 REVISION begins the hash of the scenes' revisions and the split (`tracks.dataset_revision`). Paths follow from the
 record's scenes, revisions, split, method and seed alone. Hidden files are no entries: a killed process may leave some.
 
-LEADERBOARD/LEDGER has a line for every entry that `submit` wrote, so that one that was edited by hand is noticed:
-
-    <sha256 of the entry's canonical JSON>  entries/2-ideal@0123456789ab/tfp+4dgs.json
-
-Lines are sorted and never removed. Who edits an entry and the ledger alike is noticed only when the entry is verified
-again from its predictions.
+LEADERBOARD/LEDGER has a line for every entry that `submit` wrote (`ledger`).
 """
 
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,23 +28,30 @@ from spike4dgs.benchmark.files import (
     sha256_json,
     write_bytes,
     write_json,
-    write_text,
 )
 from spike4dgs.benchmark.runs.record import Record, check_method_name, check_record, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
-from spike4dgs.leaderboard.thumbnails import KEY, Thumbnails, has_sheet, sheet_path, sheets
-from spike4dgs.leaderboard.tracks import ARCHIVE, LOCAL, PUBLIC, SHIPPED, place_of
+from spike4dgs.leaderboard.ledger import (
+    FOLDERS,
+    LEDGER,
+    Ledger,
+    add_line,
+    check_listed,
+    entry_paths,
+    mark_replaced,
+    read_ledger,
+    same_but_for_case,
+)
+from spike4dgs.leaderboard.thumbnails import KEY, SUFFIX, Thumbnails, has_sheet, read_sheet, sheet_path, sheets
+from spike4dgs.leaderboard.tracks import ARCHIVE, SHIPPED, on_release, place_of, released_targets
 
 SCHEMA = "spike4dgs-entry/2"
 CLAIMED, RE_SCORED, RE_FITTED = LABELS = ("claimed", "re-scored", "re-fitted")  # from the weakest to the strongest
-FOLDERS = (PUBLIC, LOCAL, ARCHIVE)
 KIND = "a leaderboard entry"  # of files, in errors
 BOARD = "leaderboard.json"
+_NEXT = f".next{SUFFIX}"  # of a sheet that waits for its entry
 WAIT_S = 600.0  # for other submissions; one takes a second under the lock
-LEDGER = "LEDGER"
 Entry = dict[str, Any]
-Ledger = frozenset[tuple[str, str]]  # (sha256, path below the leaderboard)
-_LINE = re.compile(r"([0-9a-f]{64})  (\S+)")
 _LARGEST = 1e15  # of any number: sums and squares of such numbers stay finite
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{i}" for port in ("com", "lpt") for i in range(10))}  # on Windows
 
@@ -135,17 +136,22 @@ def parse_entry(data: bytes, where: Path, path: str) -> tuple[Entry, str]:
     record = with_later_metrics(entry["record"])  # its form is a part of the entry's
     check_record(record, where)
     check_no_oracle(record, where)
+    check_targets(record, where)
     entry = {**entry, "record": record}
     if (name := entry_path(entry["record"], path.startswith(ARCHIVE))) != path:
         raise problem(where, f"the entry of {path}", f"that of {name}", "restore the file, or submit its record again")
     return entry, sha256
 
 
-def check_listed(sha256: str, path: str, where: Path, ledger: Ledger) -> None:
-    """Raise UserError unless the ledger has a line for the entry at `path` with this hash."""
-    if (sha256, path) not in ledger:
-        fix = "restore the entry, or submit its record again with --replace"
-        raise problem(where, f"an entry as {LEDGER} lists it", "another one, as after an edit by hand", fix)
+def check_targets(record: Record, where: Path) -> None:
+    """Raise UserError where the images of a scored scene are not the targets that the release has of it."""
+    dataset = on_release(record["dataset"])
+    for scene, cell in record["scenes"].items():
+        targets = released_targets(scene, dataset["scenes"][scene], dataset["split"])
+        if cell["status"] == "ok" and targets and (other := sorted(targets ^ cell["per_image"].keys())):
+            found = f"others or none: {', '.join(other)}"[:200]
+            expected = f"scores of the {len(targets)} targets of the release"
+            raise problem(f"{where}, scene {scene}", expected, found, "score the predictions again")
 
 
 def check_no_oracle(record: Record, where: str | Path) -> None:
@@ -173,40 +179,6 @@ def check_numbers(value: Any, where: Path) -> None:
             waiting += item
 
 
-def read_ledger(leaderboard: Path) -> Ledger:
-    """Return the lines of the ledger; none in a leaderboard without entries.
-
-    Raises UserError for a damaged line, and where there are entries and no ledger.
-    """
-    path = leaderboard / LEDGER
-    if not path.is_file():
-        if next(entry_paths(leaderboard, *FOLDERS), None):
-            raise problem(path, "the ledger of the entries", "none", "restore the file from version control")
-        return frozenset()
-    found = set()
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
-        if not (match := _LINE.fullmatch(line)):
-            expected = "lines of a sha256, two blanks and an entry's path"
-            raise problem(path, expected, f"line {number}: {line[:80]!r}", "restore the file from version control")
-        found.add((match[1], match[2]))
-    return frozenset(found)
-
-
-def add_line(leaderboard: Path, sha256: str, path: str) -> None:
-    """Add a line to the ledger. The caller holds the leaderboard's lock."""
-    lines = sorted({*read_ledger(leaderboard), (sha256, path)}, key=lambda line: (line[1], line[0]))
-    write_text(leaderboard / LEDGER, "".join(f"{digest}  {name}\n" for digest, name in lines))
-
-
-def entry_paths(leaderboard: Path, *folders: str) -> Iterator[str]:
-    """Yield the paths of the entries in the given ones of `FOLDERS`, sorted; hidden files are none."""
-    for folder in folders:
-        for path in sorted((leaderboard / folder).glob("*/*.json")):
-            name = path.relative_to(leaderboard)
-            if not any(part.startswith(".") for part in name.parts):
-                yield name.as_posix()
-
-
 def write_entry(
     leaderboard: Path,
     record: Record,
@@ -224,10 +196,9 @@ def write_entry(
     name = entry_path(record)
     path = leaderboard / name
     check_no_oracle(record, path)
-    for other in entry_paths(leaderboard, name.partition("/")[0]):
-        if other != name and other.casefold() == name.casefold():
-            fix = "rename the method: some file systems take the two for one"
-            raise problem(path, "a name that differs by more than case", other, fix)
+    for other in same_but_for_case({name, *entry_paths(leaderboard, name.partition("/")[0])}).get(name, ()):
+        fix = "rename the method: some file systems take the two for one"
+        raise problem(path, "a name that differs by more than case", other, fix)
     entry: Entry = {"schema": SCHEMA, "submitted": utc_now(), "verification": dict(verification), "record": record}
     if path.exists():
         try:
@@ -253,14 +224,24 @@ def write_entry(
                 raise problem(path, "no entry of this method, or the same record", "another record", fix)
     if thumbnails:
         entry = {**entry, KEY: thumbnails.stated}
-    # First ledger and sheet: a process killed in between leaves a line or a sheet too many, never an entry without one.
-    add_line(leaderboard, sha256_json(entry), name)
+    # A process that is killed in between leaves a line too many, or a sheet that waits for `remove_parts`: never an
+    # entry without its line.
+    sha256 = sha256_json(entry)
+    add_line(leaderboard, sha256, name)
     if thumbnails:
-        write_bytes(sheet_path(path), thumbnails.sheet)
+        write_bytes(_waiting(path), thumbnails.sheet)
     write_json(path, entry)
-    if KEY not in entry:
+    if thumbnails:
+        _waiting(path).replace(sheet_path(path))
+    elif KEY not in entry:
         sheet_path(path).unlink(missing_ok=True)
+    mark_replaced(leaderboard, sha256, name)
     return entry
+
+
+def _waiting(entry: Path) -> Path:
+    """Return where the new sheet of an entry waits until the entry is there."""
+    return entry.with_name(f".{entry.stem}{_NEXT}")
 
 
 def lock(leaderboard: Path) -> Any:
@@ -271,13 +252,25 @@ def lock(leaderboard: Path) -> Any:
 def remove_parts(leaderboard: Path) -> None:
     """Remove what killed processes left half written, and sheets without their entry, which the ledger lists.
 
+    A sheet whose entry was written before its process was killed comes to its place.
+
     The caller holds the leaderboard's lock.
     """
     for pattern in (".*.part*", *(f"{folder}/*/.*.part*" for folder in FOLDERS)):
         for part in leaderboard.glob(pattern):
             if part.is_symlink() or not part.is_dir():
                 part.unlink(missing_ok=True)
-    listed = {leaderboard / path for _, path in read_ledger(leaderboard)}
+    ledger = read_ledger(leaderboard)
+    for waiting in [path for folder in FOLDERS for path in leaderboard.glob(f"{folder}/*/.*{_NEXT}")]:
+        entry = waiting.with_name(f"{waiting.name[1:].removesuffix(_NEXT)}.json")
+        try:
+            stated = read_entry(leaderboard, entry.relative_to(leaderboard).as_posix(), ledger)
+            read_sheet(waiting, stated[KEY])
+            waiting.replace(sheet_path(entry))
+        except (UserError, KeyError):
+            if waiting.is_symlink() or not waiting.is_dir():
+                waiting.unlink(missing_ok=True)
+    listed = {leaderboard / path for _, path in ledger}
     for sheet in sheets(leaderboard, *FOLDERS):
         if (entry := sheet.with_suffix(".json")) in listed and not entry.is_file():
             sheet.unlink(missing_ok=True)

@@ -24,15 +24,8 @@ from spike4dgs.benchmark.metrics.table import PRIMARY
 from spike4dgs.benchmark.runs.record import with_later_metrics
 from spike4dgs.benchmark.untrusted import printable
 from spike4dgs.leaderboard import tracks
-from spike4dgs.leaderboard.entry import (
-    FOLDERS,
-    KIND,
-    Entry,
-    check_listed,
-    entry_paths,
-    parse_entry,
-    read_ledger,
-)
+from spike4dgs.leaderboard.entry import KIND, Entry, parse_entry
+from spike4dgs.leaderboard.ledger import FOLDERS, check_listed, entry_paths, read_ledger
 from spike4dgs.leaderboard.thumbnails import KEY
 
 FEWEST = 10  # entries of a leaderboard whose checks are kept: fewer are checked in less than a tenth of a second

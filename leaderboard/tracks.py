@@ -129,6 +129,22 @@ def fingerprint_path(scene: str, revision: str) -> Path:
     return FOLDER / RELEASE / f"{scene_name(scene, revision)}.npz"
 
 
+def released_targets(scene: str, revision: str, split: str) -> frozenset[str] | None:
+    """Return the names of the targets of a released scene in a split; None where the release does not say."""
+    known = revision in current_release().revisions(scene)
+    return _targets(fingerprint_path(scene, revision), split) if known else None
+
+
+@cache
+def _targets(fingerprint: Path, split: str) -> frozenset[str] | None:
+    if not fingerprint.is_file():
+        return None
+    _check_frozen(FOLDER, fingerprint)
+    facts = read_fingerprint(fingerprint).facts
+    cameras = facts["splits"].get(split, {"test": []})["test"]
+    return frozenset(name for name in facts["targets"] if name.rpartition("/")[0] in cameras) or None
+
+
 def match_release(scene: Scene) -> Match | None:
     """Return how a scene compares with the current release's of the same id by its fingerprint, the nearest of several.
 

@@ -9,12 +9,14 @@ from typing import Any
 
 from spike4dgs.benchmark.errors import UserError, problem
 from spike4dgs.benchmark.files import read_json
+from spike4dgs.benchmark.json_values.text import json_text
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import SUMS, read_info
 from spike4dgs.benchmark.runs.record import Record, same_value
 from spike4dgs.benchmark.scene.scene import Scene, open_scenes
 from spike4dgs.benchmark.untrusted import printable
-from spike4dgs.leaderboard.entry import CLAIMED, FOLDERS, RE_FITTED, Entry, check_folder
+from spike4dgs.leaderboard.entry import CLAIMED, RE_FITTED, Entry, check_folder
+from spike4dgs.leaderboard.ledger import FOLDERS, LEDGER, read_ledger, same_but_for_case
 from spike4dgs.leaderboard.rank import FILES, flags_of, make_boards
 from spike4dgs.leaderboard.reading import Reading, read_all
 from spike4dgs.leaderboard.thumbnails import KEY, check_sheet, make_thumbnails, read_sheet, sheet_path, sheets
@@ -58,6 +60,7 @@ def verify_leaderboard(
     reading = read_all(leaderboard, *FOLDERS)
     entries = reading.entries
     problems = [f"{leaderboard / printable(path)}: {reason}" for path, reason in reading.refused.items()]
+    problems += [*_missing(leaderboard, reading), *_alike(leaderboard, reading)]
     problems += [*_stale_boards(leaderboard, make_boards(reading)), *_wrong_sheets(leaderboard, reading)]
     scored, not_fitted, passed_over, not_computed = 0, 0, list[str](), list[str]()
     if predictions is not None:
@@ -84,6 +87,22 @@ def verify_leaderboard(
     return Findings(len(entries), scored, not_fitted, tuple(problems), tuple(passed_over), tuple(not_computed))
 
 
+def _missing(leaderboard: Path, reading: Reading) -> Iterator[str]:
+    """Yield a line for each path that the ledger has and no entry."""
+    for path in sorted(
+        {path for _, path in read_ledger(leaderboard)} - reading.entries.keys() - reading.refused.keys()
+    ):
+        fix = f"restore it, submit its record again, or remove its lines from {LEDGER} to withdraw it"
+        yield f"{leaderboard / printable(path)}: expected an entry, as {LEDGER} has a line of it, found none; {fix}"
+
+
+def _alike(leaderboard: Path, reading: Reading) -> Iterator[str]:
+    """Yield a line for each entry whose method's name is that of another but for case."""
+    for path, others in same_but_for_case(reading.entries.keys()).items():
+        expected = "a method's name that differs by more than case"
+        yield f"{leaderboard / path}: expected {expected}, found {', '.join(others)}; remove one of them"
+
+
 def _stale_boards(leaderboard: Path, boards: Mapping[str, Any]) -> Iterator[str]:
     """Yield a line for each board file that is not as the entries give it."""
     for folder, name in FILES.items():
@@ -92,8 +111,9 @@ def _stale_boards(leaderboard: Path, boards: Mapping[str, Any]) -> Iterator[str]
             if path.exists():
                 yield f"{path}: expected no such file, as there are no entries in {folder}/; remove it"
             continue
+        most_bytes = 2 * len(json_text(boards[folder]))  # no fixed bound: a board grows with its entries
         try:
-            found: Mapping[str, object] | None = read_json(path, "a board")
+            found: Mapping[str, object] | None = read_json(path, "a board", most_bytes)
         except UserError as e:
             yield str(e)
             continue

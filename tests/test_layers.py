@@ -30,7 +30,8 @@ ORDER = {
     "pose_refinement schedule models checkpoint msdi images matching image_network starts self_calibration "
     "trainer tuned pace fit recipes viewing recordings",
     "baselines": "nearest_view images radiance_field spike_render exposure starts tracking spacetime recipes",
-    "leaderboard": "tracks thumbnails entry reading truth_check rank verify verify_entries refit submit page season",
+    "leaderboard": "tracks thumbnails ledger entry reading truth_check rank verify verify_entries refit submit page "
+    "season",
     "studies": "kit sensors hard_cases speed_error gpu_receipt images recorder_runs recorder saved_models modality "
     "oracle_truth oracle_methods oracle_ladder faults patterns poses realism spike_agreement scene_noise "
     "second_renderer tuning results",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,20 +40,20 @@ def image_scores(board: Board, metric: str) -> ImageScores:
     """Return the scores of a metric.
 
     A row is compared if it may be ranked, the metric was computed again from its images, and it has a score for every
-    image that any of these rows has one for. An image without a score in every row, such as the first of a temporal
-    error, has no part in any mean.
+    image that most of these rows have one for, of those that have any: one row does not decide for all. An image
+    without a score in every row, such as the first of a temporal error, has no part in any mean.
     """
     left_out = {i: row.why or "not ranked" for i, row in enumerate(board.rows) if not row.ranked}
     claimed = f"{METRICS[metric].title} as claimed: nobody computed it again"
     left_out |= {i: claimed for i, row in enumerate(board.rows) if row.ranked and metric in row.unverified}
     scored = {i: _scored(row, board.scenes, metric) for i, row in enumerate(board.rows) if i not in left_out}
-    union = [sorted(set().union(*(names[s] for names in scored.values()))) for s in range(len(board.scenes))]
+    images = [_of_most([names[s] for names in scored.values()]) for s in range(len(board.scenes))]
     for i, names in scored.items():
-        lacking = sum(len(set(u) - n) for u, n in zip(union, names, strict=True))
-        if lacking or not all(union):
+        lacking = sum(len(set(u) - n) for u, n in zip(images, names, strict=True))
+        if lacking or not all(images):
             left_out[i] = f"no {METRICS[metric].title} of {lacking} images" if lacking else "no scores"
-    values = {i: [] if i in left_out else _values(board.rows[i], board.scenes, union, metric) for i in scored}
-    return ImageScores(union, {i: v for i, v in values.items() if v}, left_out, list(map(world_of, board.scenes)))
+    values = {i: [] if i in left_out else _values(board.rows[i], board.scenes, images, metric) for i in scored}
+    return ImageScores(images, {i: v for i, v in values.items() if v}, left_out, list(map(world_of, board.scenes)))
 
 
 def _scored(row: Row, scenes: list[str], metric: str) -> list[set[str]]:
@@ -66,6 +67,13 @@ def _scored(row: Row, scenes: list[str], metric: str) -> list[set[str]]:
         )
         for scene in scenes
     ]
+
+
+def _of_most(scored: list[set[str]]) -> list[str]:
+    """Return the images of a scene that more than half of the rows have a score of; rows without any do not count."""
+    counts = Counter(name for names in scored for name in names)
+    rows = sum(map(bool, scored))
+    return sorted(name for name, count in counts.items() if 2 * count > rows)
 
 
 def _values(row: Row, scenes: list[str], images: list[list[str]], metric: str) -> list[Float64]:

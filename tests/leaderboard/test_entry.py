@@ -1,13 +1,18 @@
 from __future__ import annotations
 
+import hashlib
+import itertools
 import json
 import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import submitters
 from changes import edit_json, files_in
@@ -15,11 +20,12 @@ from submissions import board, edit_with_ledger, enter, entry_of, read, submit
 
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import locked, write_bytes, write_json
+from spike4dgs.benchmark.runs.record import of_scenes
 from spike4dgs.leaderboard import entry
 from spike4dgs.leaderboard.entry import check_numbers, entry_path, remove_parts, write_entry
 from spike4dgs.leaderboard.rank import write_boards
 from spike4dgs.leaderboard.reading import read_entries
-from spike4dgs.leaderboard.thumbnails import sheet_path
+from spike4dgs.leaderboard.thumbnails import Thumbnails, sheet_path, sheet_size, webp
 
 
 @pytest.mark.parametrize(
@@ -29,6 +35,8 @@ from spike4dgs.leaderboard.thumbnails import sheet_path
         (lambda e: e["verification"].update(label="claimed"), "at verification"),
         (lambda e: e["verification"].update(label="re-fitted"), "at verification"),
         (lambda e: e.update(note="x"), "'note' was unexpected"),
+        (lambda e: e["record"]["method"].update(trained_on=["x" * 201]), "at record/method/trained_on/0"),
+        (lambda e: e["record"]["method"].update(trained_on=list(map(str, range(51)))), "at record/method/trained_on"),
         (lambda e: e["record"].update(note="x"), "at record"),
         (
             lambda e: e["verification"]["truth"]["pattern-0"].update(noise_share=0.5),
@@ -122,11 +130,17 @@ def test_the_datasets_name_leads_nowhere(done: Path, name: str) -> None:
 
 
 def test_names_that_differ_by_case_alone_are_refused(done: Path) -> None:
+    """Whatever their seeds and their boards."""
     enter(done, "rough", verified=False)
-    result = done / "out/results/Rough.json"
-    result.write_text((done / "out/results/rough.json").read_text().replace('"rough"', '"Rough"'))
-    with pytest.raises(UserError, match=r"Rough\.json: expected a name that differs by more than case"):
-        submit(result, leaderboard=done / "board")
+    record = json.loads((done / "out/results/rough.json").read_text())
+    part = of_scenes(record, ["pattern-1"])
+    for number, (found, seed) in enumerate(itertools.product((record, part), (0, 5))):
+        result = done / f"{number}.json"
+        write_json(result, {**found, "method": {**found["method"], "name": "Rough", "seed": seed}})
+        with pytest.raises(UserError, match=r"Rough.*\.json: expected a name that differs by more than case"):
+            submit(result, leaderboard=done / "board")
+        write_json(result, {**found, "method": {**found["method"], "seed": seed}})
+        assert submit(result, leaderboard=done / "board") == 0
 
 
 def test_a_seed_of_its_own_is_an_entry_of_its_own(done: Path) -> None:
@@ -187,6 +201,68 @@ def test_a_ledger_alone_is_a_leaderboard_that_was_being_made(done: Path, tmp_pat
     (tmp_path / "board").mkdir()
     (tmp_path / "board/LEDGER").write_text("")
     assert submit(done / "out/results/rough.json", leaderboard=tmp_path / "board") == 0
+
+
+def replace_entry(done: Path, monkeypatch: pytest.MonkeyPatch, killed_at: str = "") -> Path:
+    """Replace an entry and its sheet; a process is killed as it calls a function of `entry`, if one is named."""
+    path = entry_of(done)
+    old = read(path)
+    sheet = Thumbnails(webp(np.full((48, 120), 99, np.uint8), quality=50, method=6), {})
+    stated = {**old["thumbnails"], "sha256": hashlib.sha256(sheet.sheet).hexdigest()}
+    assert sheet_size(stated) == (120, 48)
+    record = {**old["record"], "method": {**old["record"]["method"], "version": "9"}}
+
+    def kill(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as changed, suppress(KeyboardInterrupt):
+        if killed_at:
+            changed.setattr(entry, killed_at, kill)
+        write_entry(done / "board", record, old["verification"], True, replace(sheet, stated=stated))
+    return path
+
+
+@pytest.mark.parametrize("killed_at", ["write_bytes", "write_json", "sheet_path", "mark_replaced"])
+def test_a_replacement_that_was_killed_leaves_an_entry_with_its_sheet(
+    entered: Path, monkeypatch: pytest.MonkeyPatch, problems: Any, killed_at: str
+) -> None:
+    path = replace_entry(entered, monkeypatch, killed_at)
+    written = json.loads(path.read_text())["record"]["method"]["version"] == "9"
+    assert written == (killed_at in ("sheet_path", "mark_replaced"))
+    enter(entered, "bad", verified=False)  # any submission tidies up, and makes the boards
+    assert not problems(entered) and not list(path.parent.glob(".*.webp"))
+    replace_entry(entered, monkeypatch)
+    enter(entered, "rough", verified=False)
+    assert not problems(entered) and read(path)["record"]["method"]["version"] == "9"
+
+
+def test_an_earlier_entry_that_was_put_back_is_noticed(
+    entered: Path, monkeypatch: pytest.MonkeyPatch, problems: Any
+) -> None:
+    path, board = entry_of(entered), entered / "board"
+    earlier, sheet, ledger = path.read_bytes(), sheet_path(path).read_bytes(), (board / "LEDGER").read_text()
+    replace_entry(entered, monkeypatch)
+    path.write_bytes(earlier)
+    sheet_path(path).write_bytes(sheet)
+    assert any("expected an entry as LEDGER lists it" in line for line in problems(entered))
+    lines = (board / "LEDGER").read_text().splitlines()
+    assert sorted(line.endswith("  replaced") for line in lines) == [False, True]
+    assert {line.removesuffix("  replaced") for line in lines} > set(ledger.splitlines())
+    enter(entered, replace=True)  # who submits it again may put it back
+    assert not problems(entered)
+
+
+def test_an_entry_that_was_removed_is_noticed_unless_its_lines_go_too(entered: Path, problems: Any) -> None:
+    enter(entered, "rough", verified=False)
+    path = entry_of(entered)
+    sheet_path(path).unlink()
+    path.unlink()
+    write_boards(entered / "board")
+    (line,) = problems(entered)
+    assert f"{path}: expected an entry, as LEDGER has a line of it, found none; restore it" in line
+    ledger = entered / "board/LEDGER"
+    ledger.write_text("".join(line for line in ledger.read_text().splitlines(True) if "tfp+4dgs" not in line))
+    assert not problems(entered)
 
 
 @pytest.mark.slow

@@ -143,6 +143,20 @@ def test_an_entry_that_claims_it_fails_when_its_scenes_are_compared(
         verify_record(record, path, done / "out/predictions/tfp+4dgs", scenes)
 
 
+def test_an_entry_has_the_releases_targets_on_whichever_board(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An image of one entry alone, with the mean's values, would change no mean."""
+    ship(done, monkeypatch, 1e-4)
+    path = enter(done)
+
+    def add(entry: dict[str, Any]) -> None:
+        cell = entry["record"]["scenes"]["pattern-0"]
+        cell["per_image"]["cam_03/999999"] = dict(cell["metrics"])
+
+    edit_with_ledger(path, add)
+    with pytest.raises(UserError, match=r"scores of the 3 targets of the release, found .*: cam_03/999999"):
+        read(path)
+
+
 def test_a_fingerprint_that_was_exchanged_is_refused(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ship(done, monkeypatch, 0.1)
     (path,) = (tracks.FOLDER / RELEASE).glob("pattern-0@*.npz")

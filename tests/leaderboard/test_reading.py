@@ -16,7 +16,8 @@ from changes import edit_json
 from spike4dgs.benchmark.files import sha256_json, write_json
 from spike4dgs.leaderboard import entry as entries
 from spike4dgs.leaderboard import reading
-from spike4dgs.leaderboard.entry import add_line, entry_path, read_ledger
+from spike4dgs.leaderboard.entry import entry_path
+from spike4dgs.leaderboard.ledger import add_line, read_ledger
 from spike4dgs.leaderboard.page.rows import gather
 from spike4dgs.leaderboard.rank import make_boards, write_boards
 from spike4dgs.leaderboard.reading import FEWEST, read_all, read_briefs, read_checked

@@ -16,6 +16,7 @@ from nosy_methods import Darker
 from submissions import board, edit_with_ledger, enter, entry_of, files_of, raise_metric, read, refitted, submit
 
 from spike4dgs.benchmark.errors import UserError
+from spike4dgs.benchmark.files import MOST_BYTES, write_json
 from spike4dgs.benchmark.metrics.iqa.metaiqa import metaiqa_network
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.predictions import INFO, SUMS
@@ -300,6 +301,17 @@ def test_a_forged_metric_whose_weights_are_not_here_is_named(
     assert verify_leaderboard(entered / "board", **files_of(entered)) == 0
     named = "tfp+4dgs.json: says that lpips_alex was computed again; its weights or files are not here"
     assert f"not checked: {entry_of(entered).parent}/{named}" in said()
+
+
+def test_a_large_board_is_read(entered: Path, monkeypatch: pytest.MonkeyPatch, problems: Any) -> None:
+    text = "x" * MOST_BYTES
+    monkeypatch.setattr(verify_entries, "make_boards", lambda reading: {"local": {"title": text}})
+    (entered / "board/leaderboard.json").unlink()
+    write_json(entered / "board/local.json", {"title": text})
+    assert not problems(entered)
+    write_json(entered / "board/local.json", {"title": 3 * text})
+    (line,) = problems(entered)
+    assert "local.json: expected a board, " in line
 
 
 def test_flags_that_an_edit_hid_are_found(entered: Path, monkeypatch: pytest.MonkeyPatch) -> None:

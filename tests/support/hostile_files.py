@@ -183,7 +183,7 @@ def read_board(folder: Path, out: Path) -> None:
 def relist(folder: Path) -> None:
     """Give the ledger a line for each entry, as somebody who also knows the ledger would."""
     from spike4dgs.benchmark.files import sha256_json
-    from spike4dgs.leaderboard.entry import add_line
+    from spike4dgs.leaderboard.ledger import add_line
 
     board = folder / "board"
     for path in board.glob("*/*/*.json"):

@@ -13,7 +13,8 @@ from spike4dgs.benchmark.files import sha256_json, write_json
 from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.submit import submit
 from spike4dgs.leaderboard import tracks
-from spike4dgs.leaderboard.entry import add_line, read_entry, read_ledger
+from spike4dgs.leaderboard.entry import read_entry
+from spike4dgs.leaderboard.ledger import add_line, read_ledger
 from spike4dgs.leaderboard.tracks import RELEASE
 
 Record = dict[str, Any]

@@ -15,7 +15,7 @@ from spike4dgs.benchmark.files import read_json, sha256_json, write_json
 from spike4dgs.cli import main
 from spike4dgs.cli.leaderboard import ranking_table
 from spike4dgs.cli.submit import submit
-from spike4dgs.leaderboard.entry import add_line
+from spike4dgs.leaderboard.ledger import add_line
 from spike4dgs.leaderboard.page import rows
 from spike4dgs.leaderboard.page.rows import find_board, gather
 from spike4dgs.leaderboard.page.scores import compare_rows, image_scores
