@@ -23,7 +23,11 @@ from spike4dgs.benchmark.runs.run import Settings, run_matrix
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.leaderboard.verify import TOLERANCE_DB
 
-TOLERANCE = 0.05  # relative, of metrics that are not in dB
+# Of metrics that are not in dB, of their error: of 1 - SSIM, where higher is better, but of LEAST there. Fits with
+# other threads and other instructions differed by 8 % (SSIM by 0.004) and 0.4 dB at most, of the moving region by 20 %
+# (0.007) and 0.55 dB, on two tiny scenes and with two methods.
+TOLERANCE, LEAST = 0.1, 0.1
+MOVING = 2  # times as much of the moving region, which has few pixels
 
 
 @dataclass(frozen=True)
@@ -72,11 +76,12 @@ def _compare(claimed: Cell, again: Cell, where: str) -> set[str]:
     shared = [m for m, sha256 in again["computed"].items() if claimed["computed"].get(m, "none") == sha256]
     for metric in shared:
         stated, found = claimed["metrics"][metric], again["metrics"][metric]
-        in_db = METRICS[metric].unit == "dB"
-        tolerance = TOLERANCE_DB if in_db else max(TOLERANCE * abs(stated or 0), METRICS[metric].tolerance)
+        row, times = METRICS[metric], MOVING if "_dynamic" in metric else 1
+        error = max(1 - (stated or 0), LEAST) if row.higher_is_better else abs(stated or 0)
+        tolerance = times * (TOLERANCE_DB if row.unit == "dB" else max(TOLERANCE * error, row.tolerance))
         if not same_value(stated, found, tolerance):
-            allowed = f"{TOLERANCE_DB} dB" if in_db else f"{TOLERANCE:.0%}"
-            show = METRICS[metric].format
+            allowed = f"{times * TOLERANCE_DB} dB" if row.unit == "dB" else f"{tolerance:.2g}"
+            show = row.format
             expected = f"a second fit within {allowed} of the claimed {metric} {show(stated)}"
             raise problem(where, expected, show(found), "submit what this version of the method gives")
     return set(shared)

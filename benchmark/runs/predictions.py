@@ -31,6 +31,7 @@ from spike4dgs.benchmark.schemas import check_schema, load_schema
 
 SCHEMA = "spike4dgs-prediction/1"
 SUMS, INFO = "SHA256SUMS", "prediction.json"
+MOST_OF_IMAGE = 1 << 30  # bytes; noise of 8 Mpx has 16 MiB
 _LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
 
 
@@ -103,6 +104,9 @@ class Predictions:
             self._check(name)
 
     def _check(self, name: str) -> None:
+        if (size := (self.root / name).stat().st_size) > MOST_OF_IMAGE:  # before it is read
+            expected = f"an image of a target, {MOST_OF_IMAGE} bytes at most"
+            raise problem(self.root / name, expected, f"{size}", "render it again")
         if (found := sha256_file(self.root / name)) != self.sums[name]:
             fix = f"restore the image, or run the method again; {SUMS} must be written after the images"
             raise problem(self.root / name, f"sha256 {self.sums[name][:16]}...", f"{found[:16]}...", fix)

@@ -49,11 +49,11 @@ def record(finished: Path) -> Record:
 @pytest.mark.parametrize(
     ("metric", "factor", "message"),
     [
-        ("psnr_dynamic", 0.9, r"on pattern-0: expected a second fit within 0\.3 dB of the claimed psnr_dynamic"),
-        ("ssim_dynamic", 0.9, "expected a second fit within 5% of the claimed ssim_dynamic"),
-        ("flip", 1.1, "expected a second fit within 5% of the claimed flip"),
-        ("temporal_error", 1.1, "expected a second fit within 5% of the claimed temporal_error"),
-        ("spike_psnr_20", 0.0, r"within 0\.3 dB of the claimed spike_psnr_20"),
+        ("psnr_dynamic", 0.9, r"on pattern-0: expected a second fit within 0\.6 dB of the claimed psnr_dynamic"),
+        ("ssim_dynamic", 0.5, r"expected a second fit within 0\.\d+ of the claimed ssim_dynamic"),
+        ("flip", 1.2, r"expected a second fit within 0\.\d+ of the claimed flip"),
+        ("temporal_error", 1.2, "of the claimed temporal_error"),
+        ("spike_psnr_20", 0.9, r"within 0\.3 dB of the claimed spike_psnr_20"),
         ("ssim", None, "of the claimed ssim .*, found -"),
     ],
 )
@@ -62,7 +62,7 @@ def test_a_second_fit_reaches_every_metric_that_was_computed(
 ) -> None:
     """Images that were forged where things move have the PSNR of an honest fit, and no other metric of it."""
     with pytest.raises(UserError, match=message):
-        again(record, lambda m: m.update({metric: factor and m[metric] * factor if factor != 0 else m[metric] - 1}))
+        again(record, lambda m: m.update({metric: factor and m[metric] * factor}))
 
 
 def test_a_second_fit_says_which_metrics_were_compared(again: FitAgain, record: Record) -> None:

@@ -23,6 +23,7 @@ from spike4dgs.benchmark.json_values.text import parse_json
 from spike4dgs.benchmark.method import GROUP, Budget, Method, find_methods, get_method
 from spike4dgs.benchmark.plugins import is_distributed
 from spike4dgs.benchmark.runs.method_code import code_of
+from spike4dgs.benchmark.runs.predictions import MOST_OF_IMAGE
 from spike4dgs.benchmark.runs.provenance import Provenance
 from spike4dgs.benchmark.runs.refinement import View
 from spike4dgs.benchmark.scene.cameras import Camera
@@ -32,7 +33,6 @@ PROGRESS, NOTE, RENDERED, DONE, FAILED = "progress", "note", "rendered", "done",
 COSTS = ("fit_seconds", "render_fps", "peak_memory_mb", "model_mb")
 MODEL = "model.safetensors"  # in the work folder
 MOST = 1 << 20  # bytes of a line
-MOST_OF_IMAGE = 1 << 30  # noise of 8 Mpx has 16 MiB
 _LENGTH = struct.Struct("<Q")
 _PLAIN = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # a FIFO does not hold the reader
 

@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 import subprocess
 from dataclasses import replace
@@ -10,8 +11,10 @@ from changes import edit_json, flip_bit
 
 from spike4dgs.benchmark import Target, UserError
 from spike4dgs.benchmark.files import sha256_file
+from spike4dgs.benchmark.runs import predictions
 from spike4dgs.benchmark.runs.predictions import (
     INFO,
+    MOST_OF_IMAGE,
     SUMS,
     MethodInfo,
     PredictionInfo,
@@ -109,6 +112,13 @@ def test_a_flipped_byte_is_refused_by_name(folder: Path) -> None:
     with pytest.raises(UserError, match=r"cam_03/000060\.exr"):
         found.verify()
     found.read(TARGETS[1])
+
+
+def test_an_image_that_is_too_large_is_refused_before_it_is_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(predictions, "sha256_file", lambda path: pytest.fail("read"))
+    os.truncate(folder / "cam_03/000020.exr", MOST_OF_IMAGE + 1)  # a hole: it takes no room
+    with pytest.raises(UserError, match=f"000020.exr: expected an image of a target, {MOST_OF_IMAGE} bytes at most"):
+        open_predictions(folder, TARGETS).verify()
 
 
 def test_damaged_sums_and_a_name_listed_twice_are_refused(folder: Path) -> None:

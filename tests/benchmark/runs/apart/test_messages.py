@@ -7,7 +7,8 @@ import pytest
 
 from spike4dgs.benchmark import UserError
 from spike4dgs.benchmark.files import MOST_BYTES
-from spike4dgs.benchmark.runs.apart.messages import MOST_OF_IMAGE, read_image
+from spike4dgs.benchmark.runs.apart.messages import read_image
+from spike4dgs.benchmark.runs.predictions import MOST_OF_IMAGE
 
 
 def test_an_image_is_read_and_stays(tmp_path: Path) -> None:
