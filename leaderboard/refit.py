@@ -95,7 +95,7 @@ def _fit_scene(
     out: Path,
     console: Console,
     apart: Apart,
-) -> Mapping[str, Any]:
+) -> Cell:
     wanted, where = record["method"], f"{record['method']['name']} on {scene.id}"
     if claimed["status"] != "ok" or claimed["budget"] is None or wanted["seed"] is None:
         fix = "submit without --refit"
@@ -111,7 +111,7 @@ def _fit_scene(
     metrics = tuple(select_metrics().among(claimed["computed"]).weights)
     settings = Settings(out, wanted["seed"], device, budget, metrics, apart=apart, refined=refined)
     records = {r["method"]["name"]: r for r in run_matrix([scene], [method], settings, console)}
-    cell: Mapping[str, Any] = records[wanted["name"]]["scenes"][scene.id]
+    cell: Cell = records[wanted["name"]]["scenes"][scene.id]
     if cell["status"] != "ok" or cell["metrics"]["psnr"] is None:
         raise problem(where, "a second fit that ends", cell["error"] or "no PSNR", f"see {out}")
     return cell
