@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -146,7 +147,8 @@ def _enter(verified: Sequence[Verified], leaderboard: Path, replace: bool, refus
         ranked = ranked or at.startswith("place")
         found.standings.append(f"{one.record['method']['name']}: {v['label']}{why}, {at}")
     if ranked:  # an interval, which takes a comparison with all others
-        found.standings.append(f"ranks, with their intervals: spike4dgs leaderboard --leaderboard {leaderboard}")
+        command = f"spike4dgs leaderboard --leaderboard {shlex.quote(str(leaderboard))}"
+        found.standings.append(f"ranks, with their intervals: {command}")
     places = [place_of(one.record) for one, _ in entered]
     for folder, reason in dict.fromkeys((p.folder, p.why) for p in places if not p.is_public):
         found.standings.append(f"local board, in {leaderboard / FILES[LOCAL]}, not on a track: {folder}: {reason}")

@@ -22,7 +22,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.files import read_json, sha256_json
 from spike4dgs.benchmark.method import DEFAULT_GIVEN, is_changed
 from spike4dgs.benchmark.release.fingerprint import Match, compare, read_fingerprint
@@ -214,7 +214,7 @@ def track_scenes(name: str) -> dict[str, str]:
     """
     tracks = {track.name: track for track in current_release().tracks}
     if name not in tracks:
-        raise problem("track", f"one of {', '.join(tracks)}", repr(name), "correct the name")
+        raise unknown("track", name, tracks)
     scenes = {scene: revision for scene, revision in tracks[name].scenes.items() if revision is not None}
     if tracks[name].announced:
         raise problem("track", "one whose scenes are released", f"{name}, which is only announced", "choose another")

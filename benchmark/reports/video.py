@@ -53,7 +53,8 @@ def video_writer(path: Path, size: tuple[int, int], fps: float, *, gray: bool) -
             nonlocal count
             count += 1
             if frame.shape[:2] != size[::-1]:
-                raise problem(path, f"frames of {size[0]}x{size[1]}", f"{frame.shape}", "render all at one size")
+                found = f"{frame.shape[1]}x{frame.shape[0]}"
+                raise problem(path, f"frames of {size[0]}x{size[1]}", found, "render all at one size")
             writer.write(frame if gray else np.ascontiguousarray(_neutral(frame)[:, :, ::-1]))
 
         try:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from spike4dgs.benchmark.errors import problem
+from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.reports.console import seeds_of_methods
 from spike4dgs.benchmark.runs.record import Record, is_complete, read_record
 from spike4dgs.benchmark.runs.refinement import is_refined
@@ -249,11 +249,10 @@ def find_board(boards: Sequence[Board], name: str) -> Board:
     for board, title in zip(boards, known, strict=True):
         if name in (board.name, title):
             return board
-    names = ", ".join(known)
     if name in {track.name for track in current_release().tracks}:
-        fix = f"choose one of {names}, or enter the first result with `spike4dgs submit`"
+        fix = f"choose one of {', '.join(known)}, or enter the first result with `spike4dgs submit`"
         raise problem("--track", "a track with entries", f"{name}, which has none yet", fix)
-    raise problem("--track", f"one of {names}", repr(name), "correct the name")
+    raise unknown("--track", name, known)
 
 
 def in_words(dataset: Mapping[str, Any]) -> str:

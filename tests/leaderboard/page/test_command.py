@@ -93,8 +93,8 @@ def test_entries_of_ones_own_stand_among_the_published_ones(few: Path, capsys: p
 
 
 def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["leaderboard", "--metric", "nothing", "--leaderboard", str(COMMITTED)]) == 2
-    assert "psnr_dynamic" in capsys.readouterr().err
+    assert main(["leaderboard", "--metric", "psnr_dynamc", "--leaderboard", str(COMMITTED)]) == 2
+    assert "did you mean 'psnr_dynamic'" in capsys.readouterr().err
 
 
 def test_a_run_without_its_scenes_gives_a_page_without_images(
