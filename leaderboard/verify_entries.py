@@ -20,6 +20,7 @@ from spike4dgs.leaderboard.ledger import FOLDERS, LEDGER, read_ledger, same_but_
 from spike4dgs.leaderboard.rank import FILES, flags_of, make_boards
 from spike4dgs.leaderboard.reading import Reading, read_all
 from spike4dgs.leaderboard.thumbnails import KEY, check_sheet, make_thumbnails, read_sheet, sheet_path, sheets
+from spike4dgs.leaderboard.tracks import ARCHIVE
 from spike4dgs.leaderboard.truth_check import SecondRenderings, TruthCheck, no_renderings, once_a_scene
 from spike4dgs.leaderboard.verify import TOLERANCE_DB, revisions_of, verify_record
 
@@ -88,10 +89,11 @@ def verify_leaderboard(
 
 
 def _missing(leaderboard: Path, reading: Reading) -> Iterator[str]:
-    """Yield a line for each path that the ledger has and no entry."""
-    for path in sorted(
-        {path for _, path in read_ledger(leaderboard)} - reading.entries.keys() - reading.refused.keys()
-    ):
+    """Yield a line for each path that the ledger has and no entry; the package comes without any archive."""
+    listed = {path for _, path in read_ledger(leaderboard)}
+    if not (leaderboard / ARCHIVE).is_dir():
+        listed = {path for path in listed if not path.startswith(f"{ARCHIVE}/")}
+    for path in sorted(listed - reading.entries.keys() - reading.refused.keys()):
         fix = f"restore it, submit its record again, or remove its lines from {LEDGER} to withdraw it"
         yield f"{leaderboard / printable(path)}: expected an entry, as {LEDGER} has a line of it, found none; {fix}"
 

@@ -263,6 +263,10 @@ def test_an_entry_that_was_removed_is_noticed_unless_its_lines_go_too(entered: P
     ledger = entered / "board/LEDGER"
     ledger.write_text("".join(line for line in ledger.read_text().splitlines(True) if "tfp+4dgs" not in line))
     assert not problems(entered)
+    ledger.write_text(f"{'0' * 64}  archive/a@0/a.json\n" + ledger.read_text())
+    assert not problems(entered), "as the package has no archive"
+    (entered / "board/archive").mkdir()
+    assert len(problems(entered)) == 1
 
 
 @pytest.mark.slow
