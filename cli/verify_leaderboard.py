@@ -51,15 +51,15 @@ def verify_leaderboard(
         refit: Fit again the entries labelled re-fitted.
         container: Command that starts the process of such a fit, as in `submit`.
     """
-    if not leaderboard.is_dir():
-        fix = "run this in a checkout, or give the leaderboard's folder"
-        raise problem(leaderboard, "a leaderboard", "no such folder", fix)
     if predictions is not None and not predictions.is_dir():
         raise problem(predictions, "a folder of predictions, METHOD/SCENE", "no such folder", "correct --predictions")
     asked = {"--predictions": predictions, "--scenes": scenes, "--refit": refit, "--container": container}
     for option, needed in _NEEDS.items():
         if asked[option] and (lacks := [name for name in needed if not asked[name]]):
             raise problem(option, f"{' and '.join(needed)} beside it", f"no {', '.join(lacks)}", "give all of them")
+    if not leaderboard.is_dir():
+        fix = "run this in a checkout, or give the leaderboard's folder"
+        raise problem(leaderboard, "a leaderboard", "no such folder", fix)
     release = current_release()
 
     def again(record: Record, opened: Sequence[Scene]) -> object:

@@ -334,7 +334,10 @@ def test_what_cannot_be_done_is_said(fitted: Path, recorded: Path, tmp_path: Pat
     for arguments, message in (
         (("--out", str(fitted), "--seed", "1"), "another --out, or remove it"),
         (("--out", str(recorded)), "expected a folder for the results of a fit, found a recording (scene.json)"),
-        (("--out", str(tmp_path / "b"), "--method", "magic"), "one of "),
+        (
+            ("--out", str(tmp_path / "b"), "--method", "magic"),
+            "--method: expected a name that `spike4dgs methods` lists, found 'magic'",
+        ),
         (("--out", str(tmp_path / "c"), "--budget", "much"), "--budget"),
         (("--out", str(tmp_path / "e"), "--set", "images.time_spacing_ticks=0"), "_ticks and max_times of 1"),
         (("--out", str(tmp_path / "e"), "--set", "density.refine_every=0"), "refine_every of 1 step or more"),
