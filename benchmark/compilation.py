@@ -87,7 +87,7 @@ def _digest_of(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
 
 
 def parts_digest(function: Callable[..., Any]) -> str:
-    """Return a digest of a function, of the functions that it calls, and of the constants that they name.
+    """Return a digest of a function, of the functions that it calls, by name and code, and of the constants they name.
 
     Constants are numbers, texts, tuples and arrays in the functions' modules, in other modules of this package that
     they name, and in closures. Of an intrinsic, which writes code by classes and nested functions, the whole source of
@@ -102,7 +102,7 @@ def parts_digest(function: Callable[..., Any]) -> str:
         if isinstance(value, FunctionType):
             if value not in seen:
                 seen.add(value)
-                digest.update(repr(_instructions(value.__code__)).encode())
+                digest.update(f"{value.__qualname__} {_instructions(value.__code__)!r}".encode())
                 for part in _parts(value):
                     add(part)
         elif isinstance(intrinsic := getattr(value, "_defn", None), FunctionType):

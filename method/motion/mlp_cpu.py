@@ -71,7 +71,6 @@ def _strip(vectors: int, lanes: int) -> Any:
     """Return the kernel of M rows by `vectors * lanes` columns, in tiles of four rows and of one."""
     four, one = _tile(4, vectors, lanes), _tile(1, vectors, lanes)
 
-    @njit(nogil=True, error_model="numpy")
     def strip(
         a: Any, at_a: int, row_a: int, next_a: int, b: Any, at_b: int, row_b: int, c: Any, at_c: int, row_c: int,
         m: int, k: int, floor: np.float32,
@@ -82,7 +81,9 @@ def _strip(vectors: int, lanes: int) -> Any:
         for i in range(whole, m):
             one(a, at_a + i * row_a, row_a, next_a, b, at_b, row_b, c, at_c + i * row_c, row_c, k, floor)
 
-    return strip
+    # Kernels that were compiled in two processes are linked by the names of what they call: one name, one code.
+    strip.__qualname__ = f"strip_{vectors}_{lanes}"
+    return njit(nogil=True, error_model="numpy")(strip)
 
 
 _wide, _narrow, _column = _strip(2, WIDTH), _strip(1, WIDTH), _strip(1, 1)

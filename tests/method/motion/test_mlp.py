@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from spike4dgs.method.motion import mlp_cpu
 from spike4dgs.method.motion.mlp import perceptron, perceptron_reference
 from spike4dgs.method.motion.mlp_cpu import BLOCK, add_product
 
@@ -62,3 +63,12 @@ def test_a_product_reads_and_writes_its_part_of_the_arrays_alone(m, n, k):
     expected[1:, 2 : n + 2] = np.maximum(expected[1:, 2 : n + 2] + a[1:].T.astype(float) @ b[1 : k + 1, 3:], 0.25)
     add_product(a, m, 1, m, b, n + 3 + 3, n + 3, c, n + 5 + 2, n + 5, m, n, k, np.float32(0.25))
     np.testing.assert_allclose(c, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_parts_of_kernels_have_names_of_their_own() -> None:
+    """Two kernels from the cache, compiled in two processes, are linked by the names of what they call.
+
+    With one name for three codes, a gradient compiled after the values were, in another process, called the wrong one.
+    """
+    names = {part.py_func.__qualname__ for part in (mlp_cpu._wide, mlp_cpu._narrow, mlp_cpu._column)}
+    assert len(names) == 3
