@@ -26,6 +26,7 @@ from spike4dgs.method.two_threads import on_two_threads
 BLOCK = 128  # rows: the activations and gradients of a block, 160 columns each, fill a third of a second-level cache
 WIDTH = 8  # lanes of a vector, on any processor
 ANY, POSITIVE = np.float32(-np.inf), np.float32(0)
+FIRST = np.int64(0)  # of a 0 numba makes a type of its own, and a kernel for it
 
 
 def _tile(rows: int, vectors: int, lanes: int) -> Any:
@@ -111,7 +112,7 @@ def _activations(x: Any, at: int, w: Any, bias: Any, out: Any, n: int) -> None:
         for i in range(len(bias)):
             out[r, i] = bias[i]
     d, m = w.shape
-    add_product(x, at * d, d, 1, w, 0, m, out, 0, m, n, m, d, POSITIVE)
+    add_product(x, at * d, d, 1, w, FIRST, m, out, FIRST, m, n, m, d, POSITIVE)
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -126,7 +127,7 @@ def _forward(
     for at in range(0, len(x), BLOCK):
         n = min(BLOCK, len(x) - at)
         _activations(x, at, w1, b1, h1, n)
-        _activations(h1, 0, w2, b2, h2, n)
+        _activations(h1, FIRST, w2, b2, h2, n)
         for r in range(n):
             for i in range(len(b3)):
                 out[at + r, i] = b3[i]
@@ -146,9 +147,10 @@ def _gradients(x: Any, at: int, h: Any, grad: Any, w: Any, to_x: Any, to_w: Any,
     for r in range(n):
         for i in range(m):
             total[i] += grad[r, i]
-    to_bias += total
-    add_product(grad, 0, m, 1, w, 0, k, to_x, at * k, k, n, k, m, ANY)
-    add_product(grad, 0, 1, m, x, at * k, k, to_w, 0, k, m, k, n, ANY)
+    for i in range(m):  # numba compiles the message of an addition of arrays for as long as all of this
+        to_bias[i] += total[i]
+    add_product(grad, FIRST, m, 1, w, FIRST, k, to_x, at * k, k, n, k, m, ANY)
+    add_product(grad, FIRST, 1, m, x, at * k, k, to_w, FIRST, k, m, k, n, ANY)
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -170,7 +172,7 @@ def _backward(
     for at in range(0, len(x), BLOCK):
         n = min(BLOCK, len(x) - at)
         _activations(x, at, transposed[0], biases[0], h1, n)
-        _activations(h1, 0, transposed[1], biases[1], h2, n)
+        _activations(h1, FIRST, transposed[1], biases[1], h2, n)
         g2, g1 = np.zeros_like(h2), np.zeros_like(h1)
         first = 0
         for head, size in enumerate(sizes):
@@ -178,7 +180,7 @@ def _backward(
             add_product(grad, of_grad, total, 1, w3, of_w, width, g2, of_h, len(w2), n, width, size, ANY)
             add_product(grad, of_grad, 1, total, h2, of_h, len(w2), to_weights[2], of_w, width, size, width, n, ANY)
             first += size
-        _gradients(h1, 0, h2, g2, w2, g1, to_weights[1], to_biases[1], n)
+        _gradients(h1, FIRST, h2, g2, w2, g1, to_weights[1], to_biases[1], n)
         _gradients(x, at, h1, g1, w1, to_x, to_weights[0], to_biases[0], n)
 
 
