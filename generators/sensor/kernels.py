@@ -74,7 +74,8 @@ def integrate(
                 k2, k3 = window[s + 2][p : p + BLOCK], window[s + 3][p : p + BLOCK]
                 g = gain[p : p + BLOCK] if len(gain) > BLOCK else gain
                 d = dark[p : p + BLOCK] if len(dark) > BLOCK else dark
-                c[:] = charge[p : p + BLOCK]
+                for i in range(BLOCK):  # an assignment of arrays compiles for as long as all the rest
+                    c[i] = charge[p + i]
                 out = words[start:stop, block]
                 constant = means or _equal(k0, k1, k2, k3)
                 if constant:
@@ -90,7 +91,8 @@ def integrate(
                     _constant(increment, c, out)
                 else:
                     _changing(w, n, c, out)
-                charge[p : p + BLOCK] = c
+                for i in range(BLOCK):
+                    charge[p + i] = c[i]
 
 
 @kernel
