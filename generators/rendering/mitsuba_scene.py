@@ -71,7 +71,7 @@ class MitsubaScene:
         self.reflectors = [
             mi.load_dict({"type": "scene", **_shapes("plain", some)}) if some else None for some in (mirrors, panes)
         ]
-        solid = {k: part for k, part in world.static.items() if k not in panes}
+        solid = {k: Part(part.mesh, _PLAIN) for k, part in world.static.items() if k not in panes}  # no light is found
         self.opaque = mi.load_dict({"type": "scene", **lamps, **_shapes("solid", solid)}) if panes else self.empty
         self._parameters = [mi.traverse(scene) for scene in (self.full, self.movers)]
         # of both scenes: a mesh's buffer as NumPy's array and as Mitsuba's, which are the same memory

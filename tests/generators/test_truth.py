@@ -14,7 +14,7 @@ from spike4dgs.benchmark.scene.scene import open_scene
 from spike4dgs.cli.make_dataset import physics_of
 from spike4dgs.generators import truth as renderings
 from spike4dgs.generators.make_dataset import SceneSettings
-from spike4dgs.generators.profiles import RATE_HZ, SPLIT_PROFILES, Job
+from spike4dgs.generators.profiles import RATE_HZ, SPLIT_PROFILES, Job, SplitSampling
 from spike4dgs.generators.render_tasks import RenderTargets, cameras_of, renderer_of
 from spike4dgs.generators.rendering.keyframes import finite
 from spike4dgs.generators.truth import _total, errors, lit_pairs, moving_region, second_renderings, second_truth
@@ -121,7 +121,10 @@ def test_noise_is_measured_where_there_is_light() -> None:
 
 def test_a_second_truth_with_the_seed_of_the_first_equals_it() -> None:
     """So the two differ in random numbers alone, where views share maps of soft light."""
-    profile = replace(SPLIT_PROFILES["tiny"], views=(2, 4), target_spp=16)
+    soft = SplitSampling(16, 8, 0.5, 4, 0.0004)
+    profile = replace(
+        SPLIT_PROFILES["tiny"], views=(2, 4), width=32, height=20, background_spp=16, target_spp=16, target_soft=soft
+    )
     job = Job("turntable", 0, 0, "tiny", profile, 0.004)
     static = renderer_of(job, cameras_of(job), truth=True).static
     tick = next(t for t in job.target_ticks if t not in job.sparse_ticks)

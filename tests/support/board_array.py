@@ -20,12 +20,11 @@ def projected(camera, s, board=BOARD):
 
 def visible(place, n=60):
     """Return the share of the motion in which each camera has all inner corners in its image."""
+    poses = [board_pose(s, place.distance_m) for s in np.linspace(0, 1, n)]
+    corners = np.concatenate([place.board.corners @ R.T + t for R, t in poses])
     shares = []
     for c in place.cameras:
-        inside = 0
-        for s in np.linspace(0, 1, n):
-            R, t = board_pose(s, place.distance_m)
-            uv, z = c.project(place.board.corners @ R.T + t)
-            inside += bool((z > 0).all() and (uv > 0).all() and (uv < [c.width, c.height]).all())
-        shares.append(inside / n)
+        uv, z = c.project(corners)
+        inside = (z > 0) & (uv > 0).all(1) & (uv < [c.width, c.height]).all(1)
+        shares.append(float(inside.reshape(n, -1).all(1).mean()))
     return shares

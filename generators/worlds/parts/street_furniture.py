@@ -16,7 +16,6 @@ from spike4dgs.generators.worlds.meshes import (
     quad,
     revolve,
     rotation,
-    scaling,
     translation,
     tube,
 )
@@ -41,15 +40,15 @@ def trees(rng: np.random.Generator) -> dict[str, Part]:
         for a in np.linspace(0, 2 * np.pi, 5)[:-1] + rng.uniform(0, 1):
             tip = fork + [0.7 * np.cos(a), 0.7 * np.sin(a), 0.9]
             trunks.append(tube([fork - [0, 0, 0.1], (fork + tip) / 2 + [0, 0, 0.1], tip], [0.07, 0.05, 0.025], 7))
+        middles, turns, sizes, shifts = [], [], [], []
         for _ in range(330):
             d = rng.normal(size=3)
             d *= rng.random() ** 0.35 / np.linalg.norm(d)
-            middle = fork + [0, 0, 1.15] + d * (1.35, 1.2, 1.1)
-            turn = np.eye(4)
-            turn[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-            card = quad((0, 0, 0), (1, 0, 0), (0, 1, 0), (0.2, 0.2))
-            card = card.moved(translation(*middle) @ turn @ scaling(*rng.uniform(0.16, 0.30, 2), 1))
-            leaves.append(Mesh(card.vertices, card.faces, card.uv + rng.random(2), smooth=False))
+            middles.append(fork + [0, 0, 1.15] + d * (1.35, 1.2, 1.1))
+            turns.append(rng.normal(size=(3, 3)))
+            sizes.append(rng.uniform(0.16, 0.30, 2))
+            shifts.append(rng.random(2))
+        leaves.append(_cards(*map(np.array, (middles, turns, sizes, shifts))))
         tubs.append(box((1.15, 1.15, 0.5), (x, y, PAVEMENT_Z + 0.25), 0.8))
         soil.append(quad((x, y, PAVEMENT_Z + 0.503), (1.0, 0, 0), (0, 1.0, 0)))
     bark = mix(fractal((64, 64), rng, 16), (0.09, 0.065, 0.04), (0.30, 0.23, 0.16))
@@ -60,6 +59,19 @@ def trees(rng: np.random.Generator) -> dict[str, Part]:
         "tubs": Part(merge(tubs), Material(paving((96, 96), rng, (16, 32), (0.40, 0.24, 0.17), (0.60, 0.40, 0.30)))),
         "soil": Part(merge(soil), Material(mix(fractal((64, 64), rng, 8), (0.04, 0.03, 0.02), (0.16, 0.11, 0.07)))),
     }
+
+
+def _cards(middles: np.ndarray, turns: np.ndarray, sizes: np.ndarray, shifts: np.ndarray) -> Mesh:
+    """Return leaf cards at `middles` [N, 3], turned by the rotation nearest to `turns` [N, 3, 3], of `sizes` [N, 2].
+
+    Each shows another part of the leaves' image, shifted by `shifts` [N, 2].
+    """
+    card = quad((0, 0, 0), (1, 0, 0), (0, 1, 0), (0.2, 0.2))
+    places = np.linalg.qr(turns)[0] @ (np.eye(3) * np.insert(sizes, 2, 1, axis=1)[:, None])
+    vertices = card.vertices @ places.swapaxes(1, 2) + middles[:, None]
+    faces = card.faces + 4 * np.arange(len(middles))[:, None, None]
+    uv = card.uv + shifts[:, None]
+    return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), uv.reshape(-1, 2), smooth=False)
 
 
 def furniture(rng: np.random.Generator) -> dict[str, Part]:

@@ -64,15 +64,14 @@ def whole(r) -> np.ndarray:
 
 def radiances(r: SplitRenderer, where: np.ndarray, streams: range, maps: bool | None) -> np.ndarray:
     """Return renderings [streams, K] of SPP samples: whole paths (maps None), split without maps, or with them."""
-    found = []
     known = r._maps_at(T_S) if maps else []
     r._scene.set_time(T_S)
-    for stream in streams:
-        if maps is None:
-            found.append(gray(r._tracer.trace(where, SPP, stream, True)))
-        else:
-            found.append(gray(r._tracer.split(where, SPP, stream, True, known)))
-    return np.stack(found).astype(np.float64)
+    many, numbers = np.tile(where, len(streams)), np.repeat(streams, len(where))  # of one launch: each takes long
+    if maps is None:
+        found = r._tracer.trace(many, SPP, numbers, True)
+    else:
+        found = r._tracer.split(many, SPP, numbers, True, known)
+    return gray(found).astype(np.float64).reshape(len(streams), -1)
 
 
 def test_parts_are_the_path_in_the_mean(r, whole, monkeypatch):
