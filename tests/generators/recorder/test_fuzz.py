@@ -1,4 +1,4 @@
-"""Ten thousand hostile cases: frame tags, torn and lost blocks, profiles. Only documented errors, no wrong tick.
+"""Six thousand hostile cases: frame tags, torn and lost blocks, profiles. Only documented errors, no wrong tick.
 
 Each seed from Hypothesis is a batch of cases; a failure names the seed and the case.
 """
@@ -23,7 +23,7 @@ from spike4dgs.generators.recorder.frames.layouts import LAYOUTS, Layout, make_l
 from spike4dgs.generators.recorder.frames.ticks import Run, TickCounter
 from spike4dgs.generators.recorder.rig_profile import RigProfile, load_profile
 
-TAG_CASES, STREAM_CASES, PROFILE_CASES = 2000, 2000, 2000  # streams: for each layout
+TAG_CASES, STREAM_CASES, PROFILE_CASES = 1000, 1000, 1000  # streams: for each layout
 BATCH = 100
 SIZES = {"plain": (13, 5), "padded-rows": (16, 3), "tagged-rows": (16, 6), "line-tagged": (24, 4)}
 

@@ -23,7 +23,7 @@ import numpy as np
 from spike4dgs.generators.rendering.render import MultiViewRenderer
 from spike4dgs.generators.rig import cameras
 from spike4dgs.generators.worlds import WORLDS
-world = WORLDS["car"].build(0, 0, 0.02)
+world = WORLDS["turntable"].build(0, 0, 0.02)
 renderer = MultiViewRenderer(world, cameras(world, 32, 20, (4,)), seed=0, spp=32, background_spp=128)
 np.savez(
     sys.argv[1], key=renderer.keys(0.01), again=renderer.keys(0.01), background=renderer.background,

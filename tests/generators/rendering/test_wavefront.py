@@ -58,12 +58,6 @@ def test_a_blur_is_that_of_the_radiance_and_keeps_its_sum(wavefront):
     )
     inside = np.s_[3:-3, 3:-3]  # beyond the image's edge only the renderer sees
     assert np.abs(sharp - expected)[inside].mean() > 0.01
-    print(
-        "BLUR",
-        np.abs(sharp - expected)[inside].mean(),
-        np.abs(blurred - expected)[inside].mean(),
-        blurred[inside].mean() / expected[inside].mean(),
-    )
     assert np.abs(blurred - expected)[inside].mean() < 0.004  # the noise of both
     assert blurred[inside].mean() == pytest.approx(expected[inside].mean(), rel=2e-3)
 

@@ -269,7 +269,7 @@ def test_shot_noise_is_the_twins(height, width, photons, on, seed):
 
 def test_intervals_vary_as_photons_do():
     """Against a plain simulation that draws a Poisson number of photons in every tick."""
-    n, photons, rate = 20_000, 400, 0.11
+    n, photons, rate = 10_000, 400, 0.11
     shape, rng = (20, 30), np.random.default_rng(0)
     light = np.full(shape, rate / 0.6, np.float32)
     charge = random_charge(*shape, [5])

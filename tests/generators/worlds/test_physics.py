@@ -147,7 +147,7 @@ def test_bodies_stay_rigid_and_do_not_enter_each_other_or_the_table(name, varian
     assert surface.bodies.max() == count - 1
     own = Trajectory(path.start_s, path.positions[:, :count], path.quaternions[:, :count])
     others, every, shape = ~np.eye(count, dtype=bool), np.arange(count), None
-    for t in np.linspace(0, 0.1, 41):
+    for t in np.linspace(0, 0.1, 21):
         points = surface.vertices(t).reshape(count, -1, 3)
         assert points[..., 2].min() > -SOFT_M
         seen = local_points(own, t, points)
