@@ -110,7 +110,7 @@ def test_a_scene_killed_on_a_cluster_and_finished_here_has_the_bytes_of_one_made
     assert main(["make-dataset", "car", *options]) == 0
     output = capfd.readouterr().out
     assert "car-0-tiny: key frames 2/2" in output and "car-0-tiny: background" not in output
-    assert json.loads((tmp_path / "car-0-tiny.report.json").read_text())["plan"]["keys"] == 5
+    assert json.loads((tmp_path / "car-0-tiny.report.json").read_text())["plan"]["keys"] == 4
     assert not (tmp_path / ".work").exists()
     beside = tmp_path / "beside"
     assert main(["make-dataset", "blank", "car", *options[:-1], str(beside), "--workers", "2"]) == 0
