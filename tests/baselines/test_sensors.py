@@ -37,7 +37,7 @@ from spike4dgs.method.torch_state import seeded
 from spike4dgs.method.trainer import Trainer
 from spike4dgs.method.training_views.training_images import TrainingImages
 
-WORLD = ToyWorld(width=48, height=30, n_ticks=520, travel=0.3)  # two frames
+WORLD = ToyWorld(width=48, height=30, n_ticks=520, travel=0.3, views=(0, 1, 2, 5, 7))  # two frames
 QUICK = FitRequest(Budget(0.004), progress=silent)
 
 

@@ -33,7 +33,7 @@ HEIGHT, WIDTH, TICKS = 30, 48, 120
 
 @cache
 def usual() -> TrainingScene:
-    return ToyWorld(width=WIDTH, height=HEIGHT, n_ticks=TICKS).training
+    return ToyWorld(width=WIDTH, height=HEIGHT, n_ticks=TICKS, views=(0, 2, 5, 7)).training
 
 
 def stream(spikes: np.ndarray) -> SpikeStream:

@@ -36,7 +36,7 @@ TRUE = Initialization(lambda r: Start(r.scene.cameras, *WORLD.surfaces(r.scene.c
 PARTS = Parts({"intervals": INTERVALS}, {"true": TRUE}, MOTIONS, SUPERVISIONS)
 
 
-def fitted(apart: bool, supervision: str = "pixel", steps: int = 100) -> FittedModel:
+def fitted(apart: bool, supervision: str = "pixel", steps: int = 70) -> FittedModel:
     coarse = 3 * steps // 10
     own = {"trainer.coarse_steps": coarse, "trainer.fine_steps": steps - coarse, "trainer.freeze_background": True}
     method = RecipeMethod(Recipe("test", "intervals", "true", "paths", supervision, {**QUICK, **own}), PARTS)

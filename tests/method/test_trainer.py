@@ -29,7 +29,10 @@ from spike4dgs.method.training_views.training_images import Spans, TrainingImage
 
 def test_a_moving_board_is_seen_from_a_new_viewpoint_better_than_by_a_static_scene():
     """By STG; 4DGS is in `test_fit`."""
-    steps = {"spacetime": {"trainer.fine_steps": 180}, "static": {"trainer.coarse_steps": 120}}
+    steps = {
+        "spacetime": {"trainer.coarse_steps": 30, "trainer.fine_steps": 60},
+        "static": {"trainer.coarse_steps": 40},
+    }
     moving, static = (method(motion, extra).fit(WORLD.training, request()) for motion, extra in steps.items())
     assert WORLD.psnr(moving, moving=True) > WORLD.psnr(static, moving=True) + 2
 

@@ -78,8 +78,8 @@ def test_fifty_steps_in_float32_are_those_in_float64(motion: str) -> None:
 
 
 def test_three_seeds_agree() -> None:
-    """Seeds have a standard deviation of 0.3 dB: three are hardly 1 dB apart."""
-    long = method("paths", {"trainer.coarse_steps": 30, "trainer.fine_steps": 50})
-    fits = [long.fit(WORLD.training, request(seed)) for seed in range(3)]
+    """Seeds have a standard deviation of 0.1 dB after so few steps."""
+    short = method("paths", {"trainer.coarse_steps": 20, "trainer.fine_steps": 30, "trainer.views_per_step": 2})
+    fits = [short.fit(WORLD.training, request(seed)) for seed in range(3)]
     scores = [WORLD.psnr(fit, moving=False) for fit in fits]
-    assert max(scores) - min(scores) < 1
+    assert max(scores) - min(scores) < 0.6

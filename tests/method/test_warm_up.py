@@ -43,7 +43,7 @@ for name in NAMES:
 before = compiled()
 assert before
 for name in NAMES:
-    METHODS[name].fit(world.training, FitRequest(Budget(scale=0.01))).render(world.held_out, 1000.0)
+    METHODS[name].fit(world.training, FitRequest(Budget(scale=0.004))).render(world.held_out, 1000.0)
 print(sorted(compiled() - before))
 """
 

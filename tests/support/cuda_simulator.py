@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from numba.cuda.simulator import kernel
+from numba.cuda.simulator.cudadrv.devicearray import FakeWithinKernelCUDAArray
 from numba.cuda.simulator.kernelapi import Dim3, FakeCUDAShared
 from numba.np.numpy_support import as_dtype
 from splat_parity import compare
@@ -61,7 +62,11 @@ def pausing(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def run_block(self: Any, grid_point: Any, *args: Any) -> None:
-    """Run one block's threads in turns, each to where it waits for the others, to their end."""
+    """Run one block's threads in turns, each to where it waits for the others, to their end.
+
+    They have the plain arrays: the simulator's own look at all names of an array to find its shape.
+    """
+    args = tuple(a._item._ary if isinstance(a, FakeWithinKernelCUDAArray) else a for a in args)
     here: Any = threading.current_thread()  # which the simulator asks for the indices
     here.blockIdx = Dim3(*grid_point)
     indices = [Dim3(*point) for point in np.ndindex(*self._block_dim)]

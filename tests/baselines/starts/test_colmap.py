@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from toy_world import GAIN, RATE_HZ, ToyWorld
+from toy_world import GAIN, RATE_HZ, ToyWorld, few_views
 
 from spike4dgs.baselines.starts import colmap as module
 from spike4dgs.baselines.starts.colmap import ColmapSettings, colmap
@@ -80,7 +80,7 @@ def test_a_failure_says_how_many_views_are_registered(monkeypatch: pytest.Monkey
 
 def test_points_are_those_of_a_plane_sweep_with_the_estimated_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as rows with given poses begin with, however few features the views have in common."""
-    scene = WORLD.training
+    scene = few_views(WORLD.training, 0, 2, 5, 7)  # as each is compared with all others
     moved = tuple(replace(c, t=c.t + [0.0, 0.0, 0.01]) for c in scene.cameras)
     found = Mapping(moved, np.ones((3, 3)), np.ones(3, np.float32))
     monkeypatch.setattr(module, "map_views", lambda *a, **k: found)
@@ -112,7 +112,8 @@ class UnevenWorld(ToyWorld):
 
 def test_features_and_points_are_those_of_images_without_the_pixels_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
     """The points come from a plane sweep at the estimated poses of cameras that are alike."""
-    world, even = (kind(width=120, height=76, n_ticks=96, travel=0.0, seed=1) for kind in (UnevenWorld, ToyWorld))
+    size = {"width": 120, "height": 76, "n_ticks": 96, "travel": 0.0, "seed": 1, "views": (0, 1, 3, 4, 6)}
+    world, even = (kind(**size) for kind in (UnevenWorld, ToyWorld))
     scene = replace(world.training, recordings=tuple(world.recordings(c) for c in world.training.cameras))
     seen: list[NDArray[np.float32]] = []
 

@@ -108,7 +108,7 @@ def test_the_first_time_is_one_that_most_views_have_measured(lacking: dict[int, 
 
 @cache
 def tracked() -> TrackedModel:
-    return fit.fit_tracking(job(first_steps=150, lr_means=3e-3, lr_means_last=1e-4, lr_colors=2.5e-4))
+    return fit.fit_tracking(job(first_steps=100, lr_means=3e-3, lr_means_last=1e-4, lr_colors=2.5e-4))
 
 
 def test_known_translation_is_recovered() -> None:

@@ -43,7 +43,7 @@ def trained(data: Bursts) -> tuple[Training, list[float], list[float]]:
 
 
 def test_random_weights_are_clearly_worse(data: Bursts, trained: tuple[Training, list[float], list[float]]) -> None:
-    batches = data.fixed(1, 4, TINY.ticks)
+    batches = data.fixed(1, 3, TINY.ticks)
     learned = evaluate(trained[0].network, batches, "cpu").measured
     random = evaluate(Training(data, TINY, FAST, "cpu", seed=5).network, batches, "cpu").measured
     assert learned["psnr_db"] > random["psnr_db"] + 3
@@ -192,9 +192,10 @@ def test_the_card_counts_variants_and_names_what_began_the_training() -> None:
 
 def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     folder, out = tmp_path / "data", tmp_path / "out"
-    write_toy_shard(folder, 10, instants=1, side=2)  # hidden, and scored three times: random points take the longest
+    size = {"width": 24, "height": 16, "side": 2}
+    write_toy_shard(folder, 10, instants=1, **size)  # hidden, and scored three times: random points take the longest
     for variant in (13, 14):
-        write_toy_shard(folder, variant)
+        write_toy_shard(folder, variant, **size)
     arguments = {"data": folder, "out": out, "config": "tiny", "steps": 3, "views": 4, "compute": Compute("cpu")}
     assert train_msdi(**arguments) == 0  # type: ignore[arg-type]
     printed = capsys.readouterr().out
@@ -220,7 +221,7 @@ def test_command_to_weights_and_card(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert path.read_bytes() == before and (out / "README.md").read_text() == text  # done already, but for these
     assert (out / "scores.csv").read_text() == scores
 
-    write_toy_shard(tmp_path / "more", 15, instants=1)
+    write_toy_shard(tmp_path / "more", 15, instants=1, **size)
     begun = {**arguments, "data": tmp_path / "more", "out": tmp_path / "begun", "start": path}
     assert train_msdi(**begun) == 0  # type: ignore[arg-type]
     text = (tmp_path / "begun/README.md").read_text()

@@ -1,13 +1,8 @@
 """`fit`, end to end: recordings with and without poses, without a file of truth, and killed."""
 
 import fcntl
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from io import BytesIO
@@ -29,7 +24,7 @@ from spike4dgs.benchmark import plugins
 from spike4dgs.benchmark.arrays import Float32
 from spike4dgs.benchmark.errors import UserError
 from spike4dgs.benchmark.files import write_json
-from spike4dgs.benchmark.method import FitRequest, get_method, make_budget
+from spike4dgs.benchmark.method import FitRequest
 from spike4dgs.benchmark.metrics.pose_error import align_cameras, pose_errors
 from spike4dgs.benchmark.metrics.table import METRICS
 from spike4dgs.benchmark.runs.apart.training_part import write_training_part
@@ -49,7 +44,7 @@ from spike4dgs.method.recordings.fit import MODEL, PREDICTIONS, REPORT, SHEET, V
 from spike4dgs.method.recordings.held_out import SHOWN, HeldOutView, held_out_views
 from spike4dgs.method.recordings.recording import open_recording, own_frame, streams_revision
 
-WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1)
+WORLD = ToyWorld(width=96, height=60, n_ticks=60, travel=0.0, seed=1, views=(0, 2, 5, 7))
 SHORT = ("--budget", "0.02", "--device", "cpu")
 QUICK = (*SHORT, "--poses", "given")
 
@@ -367,25 +362,25 @@ def test_the_folder_of_a_benchmark_is_refused(recorded: Path, tmp_path: Path, ca
     assert of_a_run.exists() and not (tmp_path / MODEL).exists()
 
 
-def test_a_killed_fit_resumes(recorded: Path, tmp_path: Path, no_plots: None, capsys) -> None:
-    out = tmp_path / "out"
-    arguments = ["fit", str(recorded), "--method", "tfp+static", "--out", str(out), *QUICK]
-    code = "import sys; from spike4dgs.cli import main; sys.exit(main(sys.argv[1:]))"
-    process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.DEVNULL)
-    while not (clocks := list(out.glob("work/*/fit_clock.json"))) and process.poll() is None:
-        time.sleep(0.005)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not (out / MODEL).exists()
-    checkpoint = tmp_path / "checkpoint.safetensors"  # of the same fit: one is written only every 15 s, and at the end
-    request = FitRequest(make_budget("0.02"), checkpoint=checkpoint)
-    model = get_method("tfp+static").fit(open_scene(recorded).training, request)
-    shutil.copy(checkpoint, clocks[0].parent)
-    shutil.copytree(clocks[0].parent, out / "work/another")
-    assert main(arguments) == 0
+def test_a_killed_fit_resumes(recorded: Path, tmp_path: Path, no_plots: None, capsys, monkeypatch) -> None:
+    """A killed process leaves the files as they are: a copy from before the model is saved is such a folder."""
+    whole, out, fit = tmp_path / "whole", tmp_path / "out", fit_module.timed_fit
+
+    def copied(*arguments: Any) -> Any:
+        made = fit(*arguments)
+        if not out.exists():
+            shutil.copytree(whole, out)
+        return made
+
+    monkeypatch.setattr(fit_module, "timed_fit", copied)
+    arguments = ["fit", str(recorded), "--method", "tfp+static", *QUICK, "--out"]
+    assert main([*arguments, str(whole)]) == 0
+    (clock,) = out.glob("work/*/fit_clock.json")
+    assert not (out / MODEL).exists() and "resuming after" not in capsys.readouterr().out
+    shutil.copytree(clock.parent, out / "work/another")
+    assert main([*arguments, str(out)]) == 0
     assert "resuming after" in capsys.readouterr().out and [p.name for p in (out / "work").iterdir()] == ["another"]
-    camera = WORLD.held_out
-    np.testing.assert_array_equal(load_model(out / MODEL).model.render(camera, 500.0), model.render(camera, 500.0))
+    assert same_model(out, whole)
 
 
 def test_views_of_a_few_pixels_are_refused(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from spike4dgs.method.self_calibration.clock_fit import ClockSettings
 from spike4dgs.method.self_calibration.clock_search import SearchSettings
 
 FEW = ClockSettings(times=3, moving_patches=10, static_patches=8)
-SHORT = ClockWorld(width=120, height=76, n_ticks=96, travel=0.1).training
+SHORT = ClockWorld(width=120, height=76, n_ticks=96, travel=0.1, views=(0, 2, 5, 7)).training
 
 
 def recording(scene: TrainingScene) -> Recording:

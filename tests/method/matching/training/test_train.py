@@ -89,7 +89,7 @@ def files(tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-
 
 def test_the_losses_fall(files) -> None:  # type: ignore[no-untyped-def]
     training = MatchTraining(files, TINY, SETTINGS, 0)
-    losses = [training.train_step() for _ in range(60)]
+    losses = [training.train_step() for _ in range(40)]
     first, last = (np.mean([x.coarse for x in part]) for part in (losses[:10], losses[-10:]))
     assert last < first - 1.0
     assert np.mean([x.found for x in losses[-10:]]) > np.mean([x.found for x in losses[:10]])

@@ -22,7 +22,10 @@ from spike4dgs.method.msdi.training_data import Bursts
 PAIRS = [("hexplane", "spss"), ("spacetime", "pixel+spike"), ("static", "spike-render"), ("tracking", "pixel")]
 # One with settings of its own: paths over a frozen background.
 METHODS: list[Any] = [RecipeMethod(Recipe("+".join(pair), "tfp", "rig", *pair), PARTS) for pair in PAIRS]
-METHODS += [get_method(name) for name in ("dy-spikenerf", "spike4dgs-x")]
+# Of a small field: how much its tensors hold does not matter, only where they lie.
+FIELD = {"motion.rays": 16, "motion.coarse_samples": 6, "motion.fine_samples": 4, "motion.width": 16}
+METHODS += [RecipeMethod(Recipe("dy-spikenerf", "tfp", "rig", "radiance-field", "spike", FIELD), PARTS)]
+METHODS += [get_method("spike4dgs-x")]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
