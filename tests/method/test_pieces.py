@@ -199,12 +199,7 @@ def test_a_time_is_rendered_by_the_piece_that_it_lies_in(tmp_path: Path) -> None
 def test_pieces_follow_what_one_path_through_a_long_clip_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     true = Initialization(lambda request: surfaces(request.scene, request.seed, WORLD))
     parts = Parts({"short": images}, {"true": true}, MOTIONS, SUPERVISIONS)
-    steps = {
-        "trainer.coarse_steps": 60,
-        "trainer.piece_steps": 120,
-        "images.time_spacing_ticks": 20,
-        "trainer.views_per_step": 2,
-    }
+    steps = {"trainer.coarse_steps": 60, "trainer.piece_steps": 120, "images.time_spacing_ticks": 20}
 
     def fitted(fine_steps: int) -> FittedModel:
         recipe = Recipe("test", "short", "true", "paths", "pixel", {**steps, "trainer.fine_steps": fine_steps})
