@@ -95,7 +95,7 @@ def test_a_fit_along_the_path_is_sharp_where_a_fit_of_a_still_array_is_not():
         )
         parts = Parts({"short": images}, {"true": made}, MOTIONS, SUPERVISIONS)
         # Without a background nothing sets off at its velocity, which would follow the array too.
-        steps = {"trainer.coarse_steps": 15, "trainer.fine_steps": 25}
+        steps = {"trainer.coarse_steps": 25, "trainer.fine_steps": 55}
         recipe = Recipe("test", "short", "true", "paths", "pixel", steps)
         model = RecipeMethod(recipe, parts).fit(WORLD.training, request())
         psnr[name] = WORLD.psnr(model, moving=False)
