@@ -132,8 +132,7 @@ def test_params_survive_json_and_tell_recipes_and_settings_apart() -> None:
 @pytest.mark.parametrize("name", FITTED)
 def test_each_kind_of_method_fits_and_renders_the_held_out_camera(name: str, scene: Scene) -> None:
     reports: list[tuple[int, int]] = []
-    budget = Budget(scale=0.003) if name == "dy-spikenerf" else TINY  # thousands of points of a network in each step
-    request = FitRequest(budget, progress=lambda done, total, note="": reports.append((done, total)))
+    request = FitRequest(TINY, progress=lambda done, total, note="": reports.append((done, total)))
     model = METHODS[name].fit(scene.training, request)
     target = scene.targets[1]
     camera = scene.cameras[target.camera]

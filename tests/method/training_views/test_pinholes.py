@@ -123,7 +123,7 @@ def test_training_images_are_at_the_pixels_of_the_streams() -> None:
 
 @pytest.mark.parametrize("supervision", ["pixel", "spike"])
 def test_a_fit_through_a_lens_gives_straight_images_and_bent_ones(supervision: str) -> None:
-    settings = {"trainer.coarse_steps": 60, "trainer.views_per_step": 4}
+    settings = {"trainer.coarse_steps": 80, "trainer.views_per_step": 4}
     method = RecipeMethod(Recipe("test", "short", "true", "static", supervision, settings), PARTS)
     curved = CURVED.training
     straight = replace(CURVED.held_out, distortion=())
