@@ -96,7 +96,7 @@ PARTS = Parts({"truth": truth}, {"wrong": WRONG}, MOTIONS, SUPERVISIONS)
 
 
 def method(**settings: object) -> RecipeMethod:
-    steps = {"coarse_steps": 260, "views_per_step": 4, "refine_poses": True, "lr_poses": 5e-4}
+    steps = {"coarse_steps": 400, "views_per_step": 4, "refine_poses": True}
     of_trainer = {f"trainer.{name}": value for name, value in {**steps, **settings}.items()}
     return RecipeMethod(Recipe("test", "truth", "wrong", "static", "pixel", of_trainer), PARTS)
 
@@ -110,7 +110,7 @@ def errors(cameras: tuple[Camera, ...]) -> tuple[float, float]:
 def test_wrong_poses_become_better_and_the_image_sharp() -> None:
     before = errors(wrong(SCENE, 0).cameras)
     refined = method().fit(SCENE, FitRequest())
-    kept = method(refine_poses=False, coarse_steps=40).fit(SCENE, FitRequest())  # hardly better after more
+    kept = method(refine_poses=False, coarse_steps=120).fit(SCENE, FitRequest())  # 24.0 dB, as after 400 steps
     assert isinstance(refined, FittedModel) and isinstance(kept, FittedModel)
     assert errors(kept.cameras) == before
     after = errors(refined.cameras)
@@ -270,7 +270,7 @@ def test_a_failure_fails_both_records_and_absent_weights_skip_them(small_scene: 
         assert [r["scenes"]["pattern-0"]["status"] for r in records] == [status] * 2
 
 
-STILL = ToyWorld(width=80, height=50, n_ticks=120, travel=0.0, seed=1, views=(0, 2, 5, 7))
+STILL = ToyWorld(width=80, height=50, n_ticks=120, travel=0.0, seed=1)
 
 
 @pytest.mark.parametrize("motion", ["static", "tracking"])

@@ -43,7 +43,7 @@ def trained(data: Bursts) -> tuple[Training, list[float], list[float]]:
 
 
 def test_random_weights_are_clearly_worse(data: Bursts, trained: tuple[Training, list[float], list[float]]) -> None:
-    batches = data.fixed(1, 3, TINY.ticks)
+    batches = data.fixed(1, 4, TINY.ticks)
     learned = evaluate(trained[0].network, batches, "cpu").measured
     random = evaluate(Training(data, TINY, FAST, "cpu", seed=5).network, batches, "cpu").measured
     assert learned["psnr_db"] > random["psnr_db"] + 3
@@ -121,7 +121,7 @@ def test_the_truth_has_no_error(data: Bursts) -> None:
 
 
 def test_errors_that_the_confidence_predicts_are_ranked(data: Bursts) -> None:
-    batch = data.fixed(1, 3, TINY.ticks)[0]
+    batch = data.fixed(1, 4, TINY.ticks)[0]
     scores = evaluate(Oracle(batch, off=1.0), [batch], "cpu")  # type: ignore[arg-type]
     found = scores.measured
     assert found["confidence_rank"] > 0.8
