@@ -26,7 +26,7 @@ from spike4dgs.method.two_threads import on_two_threads
 BLOCK = 128  # rows: the activations and gradients of a block, 160 columns each, fill a third of a second-level cache
 WIDTH = 8  # lanes of a vector, on any processor
 ANY, POSITIVE = np.float32(-np.inf), np.float32(0)
-FIRST = np.int64(0)  # of a 0 numba makes a type of its own, and a kernel for it
+FIRST: Any = np.int64(0)  # of a 0 numba makes a type of its own, and a kernel for it
 
 
 def _tile(rows: int, vectors: int, lanes: int) -> Any:
