@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -146,6 +146,7 @@ def _ladder(name: str, truth: Path, samples: int) -> Ladder:
     return Ladder(name, (Rung("as it is", method), *rungs), lambda n_ticks: choose_ticks(n_ticks, settings), left_out)
 
 
+@cache  # an oracle asks for it several times, and packages are looked through each time
 def _recipe_method(name: str) -> RecipeMethod:
     """Return the method of a recipe. Raises UserError where it has no oracles."""
     known = {

@@ -84,9 +84,9 @@ class HexPlane(nn.Module):
         self.register_buffer("high", high.float().clone())
         f = shape.features
         # As published: time planes start at 1 (no influence), spatial planes uniform in [0.1, 0.5].
-        self.space = nn.ParameterList(
-            [nn.Parameter(0.1 + 0.4 * torch.rand(3, r, r, f, generator=generator)) for r in shape.spatial]
-        )
+        # Of torch's device `meta`, `rand` and arithmetic would import torch's compiler: two seconds.
+        drawn = [torch.empty(3, r, r, f).uniform_(generator=generator) for r in shape.spatial]
+        self.space = nn.ParameterList([nn.Parameter(p if p.is_meta else 0.1 + 0.4 * p) for p in drawn])
         self.time = nn.ParameterList([nn.Parameter(torch.ones(3, shape.times, r, f)) for r in shape.spatial])
 
     def forward(self, means: Tensor, t: float) -> Tensor:

@@ -116,7 +116,8 @@ class ImageGenerator(nn.Module):
 def initialize(network: nn.Module) -> None:
     """Set He's normal weights for LeakyReLU and zero biases: features keep their size from layer to layer."""
     for module in network.modules():
-        if isinstance(module, nn.Conv2d):
+        # Nothing is drawn on torch's device `meta`, yet asking for it there imports torch's compiler: two seconds.
+        if isinstance(module, nn.Conv2d) and not module.weight.is_meta:
             nn.init.kaiming_normal_(module.weight, a=_SLOPE)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)

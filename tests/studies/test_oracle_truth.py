@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +31,18 @@ def scene(tiny_data: Path) -> Scene:
     return open_scene(tiny_data / "car-0-tiny")
 
 
-@pytest.fixture(scope="module")
-def truth(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Truth:
+def found_truth(scene: Scene) -> WorldTruth:
+    """The truth of the scene, its background with an eighth of the samples: no test of the written truth needs more."""
+    job = find_truth(scene).job
+    profile = replace(job.profile, background_spp=job.profile.background_spp // 8)
+    return WorldTruth(replace(job, profile=profile), find_truth(scene).cameras)
+
+
+@pytest.fixture(scope="session")  # it outlives tests of other files that a worker takes from another
+def truth(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    scene = open_scene(tiny_data / "car-0-tiny")
     made = Truth.of(tmp_path_factory.mktemp("truth"), scene.id, scene.revision, SAMPLES)
-    find_truth(scene).write(made, TICKS, SAMPLES, silent)
+    found_truth(scene).write(made, TICKS, SAMPLES, silent)
     return made
 
 
@@ -152,7 +161,7 @@ def test_what_is_there_is_kept_and_what_is_missing_is_made_again_alike(scene: Sc
     copy = Truth(Path(shutil.copytree(truth.folder, tmp_path / truth.folder.name)))
     before = everything(copy)
     copy.image_file(TICKS[1]).unlink()
-    find_truth(scene).write(copy, TICKS, SAMPLES, silent)
+    found_truth(scene).write(copy, TICKS, SAMPLES, silent)
     after = everything(copy)
     assert {p: content for p, (_, content) in after.items()} == {p: content for p, (_, content) in before.items()}
     rewritten = {p.name for p in after if after[p][0] != before[p][0]}
