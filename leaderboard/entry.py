@@ -29,7 +29,7 @@ from spike4dgs.benchmark.files import (
     write_bytes,
     write_json,
 )
-from spike4dgs.benchmark.runs.record import Record, check_method_name, check_record, with_later_metrics
+from spike4dgs.benchmark.runs.record import Record, check_agreement, check_method_name, with_later_metrics
 from spike4dgs.benchmark.schemas import check_schema, load_schema
 from spike4dgs.leaderboard.ledger import (
     FOLDERS,
@@ -134,7 +134,7 @@ def parse_entry(data: bytes, where: Path, path: str) -> tuple[Entry, str]:
     sha256 = sha256_json(entry)
     check_schema(entry, load_schema("spike4dgs.leaderboard", "entry.schema.json"), where, "submit the record again")
     record = with_later_metrics(entry["record"])  # its form is a part of the entry's
-    check_record(record, where)
+    check_agreement(record, where)
     check_no_oracle(record, where)
     check_targets(record, where)
     entry = {**entry, "record": record}

@@ -25,7 +25,7 @@ from typing import Any
 from spike4dgs.benchmark.errors import problem, unknown
 from spike4dgs.benchmark.files import read_json, sha256_json
 from spike4dgs.benchmark.method import DEFAULT_GIVEN, is_changed
-from spike4dgs.benchmark.release.fingerprint import Match, compare, read_fingerprint
+from spike4dgs.benchmark.release.fingerprint import Match, compare, read_facts, read_fingerprint
 from spike4dgs.benchmark.runs.record import NOISY, Record
 from spike4dgs.benchmark.scene.scene import Scene
 from spike4dgs.benchmark.schemas import check_schema, load_schema
@@ -140,7 +140,7 @@ def _targets(fingerprint: Path, split: str) -> frozenset[str] | None:
     if not fingerprint.is_file():
         return None
     _check_frozen(FOLDER, fingerprint)
-    facts = read_fingerprint(fingerprint).facts
+    facts = read_facts(fingerprint)
     cameras = facts["splits"].get(split, {"test": []})["test"]
     return frozenset(name for name in facts["targets"] if name.rpartition("/")[0] in cameras) or None
 

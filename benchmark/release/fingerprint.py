@@ -34,7 +34,7 @@ from spike4dgs.benchmark.scene.cameras import camera_facts
 from spike4dgs.benchmark.scene.scene import Scene, open_scene
 from spike4dgs.benchmark.spikes.counted_recording import counted
 from spike4dgs.benchmark.spikes.stream import SpikeStream
-from spike4dgs.benchmark.untrusted import read_npz
+from spike4dgs.benchmark.untrusted import Expected, read_npz
 
 FORMAT = "spike4dgs-fingerprint/1"
 SAMPLE_BYTES = 2048  # of each stream: 16,384 bits, in which a share of 1 % is seen to a tenth of itself
@@ -130,8 +130,17 @@ def write_fingerprint(path: Path, fingerprint: Fingerprint) -> None:
 
 def read_fingerprint(path: Path) -> Fingerprint:
     """Read a fingerprint. Raises UserError where the file is missing, damaged, or none."""
+    return _read(path, None)
+
+
+def read_facts(path: Path) -> dict[str, Any]:
+    """Return a fingerprint's facts alone: its other arrays are a hundred times as much. Raises UserError as well."""
+    return _read(path, {"head": Expected("u", (None,))}).facts
+
+
+def _read(path: Path, wanted: dict[str, Expected] | None) -> Fingerprint:
     what, fix = f"a fingerprint ({FORMAT})", "restore the file"
-    arrays = read_npz(path, what, fix=fix)
+    arrays = read_npz(path, what, wanted, fix)
     try:
         head = json.loads(arrays.pop("head").astype(np.uint8).tobytes())
         if head["format"] != FORMAT:

@@ -196,6 +196,11 @@ def is_complete(record: Record) -> bool:
 def check_record(record: Record, where: str | Path) -> None:
     """Raise UserError unless the record follows the schema and its numbers agree with each other."""
     check_form(record, where)
+    check_agreement(record, where)
+
+
+def check_agreement(record: Record, where: str | Path) -> None:
+    """Raise UserError unless the numbers of a record that follows the schema agree with each other."""
     if record["protocol"] != PROTOCOL:
         raise problem(where, f"protocol {PROTOCOL}", str(record["protocol"]), _AGAIN)
     if set(record["scenes"]) != set(record["dataset"]["scenes"]):
@@ -282,11 +287,10 @@ def same_value(a: float | None, b: float | None, tolerance: float) -> bool:
 
 def read_record(path: Path | str) -> Record:
     """Read and check a result record. Raises UserError where it is missing, damaged or inconsistent."""
-    path = Path(path)
-    record = read_json(path, f"a {SCHEMA} record")
+    record = read_json(Path(path), f"a {SCHEMA} record")
     check_form(record, path)
-    record = with_later_metrics(record)
-    check_record(record, path)
+    record = with_later_metrics(record)  # which keeps the form
+    check_agreement(record, path)
     return ShownRecord(record)
 
 
