@@ -133,7 +133,7 @@ def read_fingerprint(path: Path) -> Fingerprint:
     return _read(path, None)
 
 
-def read_facts(path: Path) -> dict[str, Any]:
+def read_facts(path: Path) -> Mapping[str, Any]:
     """Return a fingerprint's facts alone: its other arrays are a hundred times as much. Raises UserError as well."""
     return _read(path, {"head": Expected("u", (None,))}).facts
 
