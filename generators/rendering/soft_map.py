@@ -59,8 +59,8 @@ Light = tuple[mi.Color3f, mi.Color3f, mi.Float]  # weighted sums of matte light 
 class SoftMaps:
     """The views and the moving surfaces, with which samples find their place in a map; a tree of arrays."""
 
-    width: int
-    height: int
+    width: mi.UInt32  # a number of the data, as in `Views`
+    height: mi.UInt32
     moving: list[tuple[mi.ShapePtr, int]]  # the surfaces, and the first of `faces` of each
     faces: mi.UInt32  # [F * 4] vertices of a face, and a number that nobody reads
     cameras: mi.Float  # [C * 21] `camera_rows`
@@ -73,8 +73,8 @@ class SoftMaps:
         faces = np.zeros((len(scene.moving_faces), 4), np.uint32)
         faces[:, :3] = scene.moving_faces
         return SoftMaps(
-            cameras[0].width,
-            cameras[0].height,
+            dr.opaque(mi.UInt32, cameras[0].width),
+            dr.opaque(mi.UInt32, cameras[0].height),
             [(mi.ShapePtr(by_id[name]), first) for name, first in scene.first_faces().items()],
             mi.UInt32(aligned(faces.ravel())),
             mi.Float(aligned(camera_rows(cameras).astype(np.float32).ravel())),
@@ -122,7 +122,7 @@ class SoftMaps:
     ) -> Light:
         """Return the sums with a map's light in one pixel, where it sees a like surface."""
         x, y = mi.Int32(column), mi.Int32(row)
-        inside = active & (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
+        inside = active & (x >= 0) & (y >= 0) & (x < mi.Int32(self.width)) & (y < mi.Int32(self.height))
         at = (view * self.height + mi.UInt32(y)) * self.width + mi.UInt32(x)
         plane = dr.gather(mi.Vector4f, place.known.planes, at, inside)
         normal = mi.Vector3f(plane.x, plane.y, plane.z)

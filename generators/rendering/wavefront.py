@@ -124,8 +124,8 @@ class Samples:
 class Views:
     """What makes the rays of all views; a tree of arrays, for `dr.freeze`."""
 
-    width: int
-    height: int
+    width: mi.UInt32  # a number of the data: of Python's, each size of image would have kernels of its own
+    height: mi.UInt32
     keys: mi.UInt32  # [C + 1] numbers of the cameras, and 0: one number alone would be another kernel's
     cameras: mi.Float  # [C * 12] matrices from pixel coordinates to directions, and centres
     lenses: mi.Float | None  # [C * 9] fx, fy, cx, cy, and the distortion
@@ -138,8 +138,8 @@ class Views:
         has_lens = any(c.distortion for c in cameras)
         rows = [[*(c.R.T @ np.linalg.inv(c.K)).ravel(), *c.center] for c in cameras]
         return Views(
-            cameras[0].width,
-            cameras[0].height,
+            dr.opaque(mi.UInt32, cameras[0].width),
+            dr.opaque(mi.UInt32, cameras[0].height),
             mi.UInt32(aligned(np.array([*(zlib.crc32(c.id.encode()) for c in cameras), 0], np.uint32))),
             mi.Float(aligned(np.array(rows, np.float32).ravel())),
             mi.Float(aligned(np.array(lenses, np.float32).ravel())) if has_lens else None,
